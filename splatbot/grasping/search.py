@@ -425,7 +425,9 @@ def _by_evidence(grasps: Sequence[Grasp]) -> tuple[tuple[Grasp, ...], tuple[Gras
 
 def _doubt(grasp: Grasp) -> str:
     assert grasp.depth_distance is not None
-    away = " and ".join(f"{1e3 * value:.0f}" if np.isfinite(value) else "any" for value in grasp.depth_distance)
+    if np.isinf(grasp.depth_distance).any():
+        return "has no contact at measured depth, and there is none near"
+    away = " and ".join(f"{1e3 * value:.0f}" for value in grasp.depth_distance)
     return f"has no contact at measured depth, which is {away} mm away"
 
 

@@ -13,11 +13,12 @@ from splatbot.camera import Camera
 from splatbot.collision.confirmed import confirmed_near
 from splatbot.collision.visibility import DepthView
 from splatbot.geometry import look_at, se3_exp, transform_points
+from splatbot.grasping.advice import first_change
 from splatbot.grasping.hands import Hands
 from splatbot.grasping.measured import CONSTANTS, RawDepth, contact_distances, hand_penetration
 from splatbot.grasping.sampler import GraspSampler
 from splatbot.grasping.summary import summary
-from splatbot.grasping.types import GraspResult
+from splatbot.grasping.types import GraspResult, NoGraspError
 from splatbot.logs.raycast import RaycastScene, RaycastSurface
 from splatbot.logs.textures import Texture
 from splatbot.protocols import Array, HandShape
@@ -155,6 +156,18 @@ def test_results_state_the_support_of_each_contact_and_null_where_it_was_not_che
     unknown = summary(grasps_with(None))["grasps"][0]
     assert unknown["contact_implied"] is None
     assert unknown["contact_depth_distance_m"] is None
-    nothing = summary(grasps_with(RawDepth((), FLOOR, QUAD)))["grasps"][0]
-    assert nothing["contact_implied"] == [True, True]
-    assert nothing["contact_depth_distance_m"] == [None, None]
+
+
+def test_grasps_without_any_contact_at_measured_depth_are_not_offered_but_named() -> None:
+    result = grasps_with(RawDepth((), FLOOR, QUAD))
+    assert not result.grasps
+    with pytest.raises(NoGraspError, match="no grasp that should be executed: 10 have no contact at measured depth"):
+        result.unwrap()
+    doubtful = summary(result)["doubtful"]
+    assert len(doubtful) == 10
+    assert doubtful[0]["contact_implied"] == [True, True]
+    assert doubtful[0]["contact_depth_distance_m"] == [None, None]
+    assert doubtful[0]["rejected"] == "has no contact at measured depth, and there is none near"
+    reason, change = first_change(result, scene(), 0.08)
+    assert reason == "10 grasps fit the map, but none has a contact at measured depth"
+    assert change == "map it again from more sides"
