@@ -220,6 +220,7 @@ class GraspsRequest(Request):
     base: Pose | None = Field(None, description="T_world_base, z up; by default that of the map")
     hand_only: bool = Field(False, description="leave the arm out")
     approach: Literal["any", "top", "side"] = "any"
+    accept_implied: bool = Field(False, description="offer grasps of which no contact is at measured depth")
     friction: Annotated[float, Field(gt=0, le=2)] = 0.5
     samples: Annotated[int, Field(ge=10, le=5000)] = Field(
         400, description="places tried, four times as many with sharper rims where that finds nothing: the knob of time"

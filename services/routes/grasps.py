@@ -32,6 +32,7 @@ _ANSWER = {
     "map_version": 12,
     "target": {"label": "box", "backend": "words", "score": 0.9, "gaussians": 540, "notes": []},
     "grasps": [{"total": 0.81, "width_m": 0.04, "approach": "top", "terms": {"closure": 0.9}}],
+    "doubtful": [],
     "best_rejected": None,
     "rejected": {},
     "candidates": 2100,
@@ -63,6 +64,7 @@ def grasps(request: Request, served: ServedAfterFrames, service: Service, query:
         samples=query.samples,
         wanted=query.wanted,
         approach=query.approach,
+        accept_implied=query.accept_implied,
         seed=query.seed,
     )
     result = objects.with_notes(sampler.sample(found, options))

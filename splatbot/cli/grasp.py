@@ -38,6 +38,7 @@ def grasp(
     base: Annotated[Pose | None, tyro.conf.arg(metavar="X Y Z QW QX QY QZ")] = None,
     hand_only: bool = False,
     approach: Literal["any", "top", "side"] = "any",
+    accept_implied: bool = False,
     friction: float = 0.5,
     samples: int = 400,
     wanted: int = 10,
@@ -77,6 +78,7 @@ def grasp(
             `splatbot info --fit-plane`).
         hand_only: ignore the arm and its reachability.
         approach: direction of the approach.
+        accept_implied: offer grasps of which no contact is at measured depth; such sides follow from the visible ones.
         friction: friction coefficient between finger pads and object.
         samples: sampled surface points, which determine the time. Without a result, four times as many are tried.
         wanted: largest number of grasps.
@@ -110,7 +112,13 @@ def grasp(
     from splatbot.robots.store import load_robot
 
     options = GraspOptions(
-        friction=friction, samples=samples, pregrasp=pregrasp, wanted=wanted, approach=approach, seed=seed
+        friction=friction,
+        samples=samples,
+        pregrasp=pregrasp,
+        wanted=wanted,
+        approach=approach,
+        accept_implied=accept_implied,
+        seed=seed,
     )
     arm = load_robot(robot)
     objects = graspable_objects(map, base)

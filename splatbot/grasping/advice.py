@@ -56,7 +56,7 @@ def first_change(result: GraspResult, scene: SegmentedMap, stroke: float) -> tup
     """
     if result.doubtful:
         why = f"{len(result.doubtful)} grasps fit the map, but none has a contact at measured depth"
-        return why, "map it again from more sides"
+        return why, "map it again from more sides, or allow such grasps (--accept-implied)"
     number = result.target.number
     if 0 <= number < len(scene.objects):
         size = obstacle(scene.objects[number], stroke)

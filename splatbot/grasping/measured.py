@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from splatbot.collision.confirmed import confirmed_near
@@ -82,21 +84,44 @@ def hand_penetration(hands: Hands, points: Array, hand: HandShape, *, retreat: f
         retreat: length of the straight approach [m].
     """
     deepest = np.zeros(len(hands))
-    near = points.astype(np.float32)
-    for k in range(0, len(hands) if len(points) else 0, CONSTANTS.hands_per_chunk):
-        T = hands.T[k : k + CONSTANTS.hands_per_chunk]
-        R, at = T[:, :3, :3].astype(np.float32), T[:, :3, 3].astype(np.float32)
-        local = R.swapaxes(1, 2) @ near.T - np.einsum("kji,kj->ki", R, at)[:, :, None]
-        x, y, z = np.abs(local[:, 0]), np.abs(local[:, 1]), local[:, 2]
-        inner = hands.opening[k : k + CONSTANTS.hands_per_chunk, None].astype(np.float32) / 2
-        ahead = z > -hand.palm - retreat
+    for k, (x, y, z) in _local_points(hands, points):
+        inner = hands.opening[k, None].astype(np.float32) / 2
         finger = np.minimum(hand.width / 2 - x, np.minimum(y - inner, inner + hand.thickness - y))
         finger = np.minimum(finger, hand.tip - z)
         palm = np.minimum(hand.palm_size[0] / 2 - x, hand.palm_size[1] / 2 - y)
         palm = np.minimum(palm, -hand.palm - z)
-        inside = np.where(ahead, np.maximum(finger, palm), 0.0)
-        deepest[k : k + CONSTANTS.hands_per_chunk] = np.maximum(inside.max(axis=1), 0.0)
+        inside = np.where(z > -hand.palm - retreat, np.maximum(finger, palm), 0.0)
+        deepest[k] = np.maximum(inside.max(axis=1), 0.0)
     return deepest
+
+
+def closed_width(hands: Hands, points: Array, hand: HandShape) -> Array:
+    """Return the smallest width (K,) [m] between the fingers at which no point between them is deeper than 3 mm.
+
+    The fingers close until they meet the object. Depth of a point in a finger is defined as in
+    :func:`hand_penetration`. The width is 0 if no point is between the fingers.
+
+    Args:
+        hands: K hands with their openings.
+        points: (S, 3) measured points [m, world].
+        hand: shape of the hand.
+    """
+    width, deep = np.zeros(len(hands)), CONSTANTS.max_penetration
+    for k, (x, y, z) in _local_points(hands, points):
+        inner = hands.opening[k, None].astype(np.float32) / 2
+        between = (x < hand.width / 2 - deep) & (y < inner) & (z < hand.tip - deep) & (z > -hand.palm)
+        width[k] = 2 * np.maximum(np.where(between, y, 0.0).max(axis=1) - deep, 0.0)
+    return width
+
+
+def _local_points(hands: Hands, points: Array) -> Iterator[tuple[slice, NDArray[np.float32]]]:
+    """Yield |x|, |y| and z (3, K', S) [m] of points in the frames of some hands at a time, with their slice."""
+    near = points.astype(np.float32)
+    for first in range(0, len(hands) if len(points) else 0, CONSTANTS.hands_per_chunk):
+        k = slice(first, first + CONSTANTS.hands_per_chunk)
+        R, at = hands.T[k, :3, :3].astype(np.float32), hands.T[k, :3, 3].astype(np.float32)
+        x, y, z = (R.swapaxes(1, 2) @ near.T - np.einsum("kji,kj->ki", R, at)[:, :, None]).swapaxes(0, 1)
+        yield k, np.stack([np.abs(x), np.abs(y), z])
 
 
 def contact_distances(contacts: Array, points: Array) -> Array:

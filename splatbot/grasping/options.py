@@ -30,6 +30,7 @@ class GraspOptions:
         pregrasp: length of the straight approach from the pre-grasp to the grasp [m].
         wanted: maximum number of grasps to return.
         approach: "any", "top" or "side".
+        accept_implied: offer grasps of which no contact is at measured depth. It has no effect without raw depth.
         seed: seed of the random generator.
 
     Raises:
@@ -43,6 +44,7 @@ class GraspOptions:
     pregrasp: float = 0.10
     wanted: int = 10
     approach: str = "any"
+    accept_implied: bool = False
     seed: int = 0
 
     def __post_init__(self) -> None:

@@ -18,7 +18,7 @@ from splatbot.grasping.antipodal import Pairs, PairSearch, antipodal_pairs
 from splatbot.grasping.hands import CONSTANTS as HANDS
 from splatbot.grasping.hands import Hands, measure_hands, palm_free, place_hands
 from splatbot.grasping.measured import CONSTANTS as MEASURED
-from splatbot.grasping.measured import contact_distances, hand_penetration
+from splatbot.grasping.measured import closed_width, contact_distances, hand_penetration
 from splatbot.grasping.obstacles import around_target
 from splatbot.grasping.options import GraspOptions
 from splatbot.grasping.reach import ReachabilityCheck
@@ -63,6 +63,7 @@ CONSTANTS = GraspSearchConstants()
 
 _IN_TARGET = "hands are in the target on their way"
 _IN_MAP = "hands touch the surroundings of the target"
+_UNEVEN = "hands have something that stands out under a pad"
 _IN_DEPTH = "hands are in measured depth"
 
 
@@ -117,12 +118,12 @@ class Search:
                 self.s.scene.model.means.detach().double().numpy()[self.target.rows], self.s.hand
             )
             self.log.stage("measured depth")
-        grasps, doubtful = _by_evidence(self._search(self.o.samples))
+        grasps, doubtful = self._by_evidence(self._search(self.o.samples))
         notes = []
         too_large = not len(self.pairs.width) and self.found.too_wide > 0
         if not grasps and not too_large:
             few = min(self.o.samples, len(self.surface))
-            grasps, more_doubtful = _by_evidence(self._search(CONSTANTS.retry_factor * self.o.samples, sharp=True))
+            grasps, more_doubtful = self._by_evidence(self._search(CONSTANTS.retry_factor * self.o.samples, sharp=True))
             doubtful = more_doubtful or doubtful
             more = min(CONSTANTS.retry_factor * self.o.samples, len(self.surface))
             notes.append(f"No grasp was found with {few} samples; {more} samples with sharper edges were searched.")
@@ -225,7 +226,7 @@ class Search:
             )
         uneven = hands.protrusion > HANDS.max_protrusion
         free = ~uneven & (hands.clearance > 0.0)
-        self.log.drop("hands have something that stands out under a pad", uneven.sum())
+        self.log.drop(_UNEVEN, uneven.sum())
         self.log.drop(_IN_TARGET, (~uneven & ~free).sum())
         scored = self._scored(hands, hands.clearance)
         if len(hands) and not free.any():
@@ -276,24 +277,25 @@ class Search:
     def _outside_measured(self, scored: _Scored) -> _Scored:
         """Return the hands without confirmed points of raw depth in them, with the score term of their contacts.
 
-        A hand is checked on its approach, and closed at the planned contacts: there, depth in the fingers stops them
-        before they reach the contacts.
+        Points that stand out under a pad beyond the planned contacts stop the fingers earlier.
         """
         assert self.measured is not None
         hands = scored.hands
-        closed = replace(hands, opening=self.pairs.width[hands.pair])
-        deep = np.maximum(
-            hand_penetration(hands, self.measured, self.s.hand, retreat=self.o.pregrasp),
-            hand_penetration(closed, self.measured, self.s.hand, retreat=0.0),
-        )
+        deep = hand_penetration(hands, self.measured, self.s.hand, retreat=self.o.pregrasp)
+        wider = closed_width(hands, self.measured, self.s.hand) - self.pairs.width[hands.pair]
+        uneven = wider > 2 * HANDS.max_protrusion
+        self.log.drop(_UNEVEN, uneven.sum())
         away = contact_distances(self.pairs.contacts[hands.pair], self.measured)
         supported = (away <= MEASURED.contact_distance).mean(axis=1)
         scored = _Scored(hands, scored.clearance, {**scored.terms, "measured": supported})
-        free = deep <= MEASURED.max_penetration
-        self.log.drop(_IN_DEPTH, (~free).sum())
+        free = (deep <= MEASURED.max_penetration) & ~uneven
+        self.log.drop(_IN_DEPTH, (~free & ~uneven).sum())
         if len(free) and not free.any():
             k = int(np.argmin(deep))
-            self.log.best = self._grasp(scored, k, rejected=f"is {1e3 * deep[k]:.1f} mm deep in measured depth")
+            reason = f"is {1e3 * deep[k]:.1f} mm deep in measured depth"
+            if deep[k] <= MEASURED.max_penetration:
+                reason = f"has measured depth under its pads, so that it closes {1e3 * wider[k]:.0f} mm wider"
+            self.log.best = self._grasp(scored, k, rejected=reason)
         kept = scored.select(free)
         return kept.select(np.lexsort((-kept.totals, kept.terms["measured"] == 0.0)))  # without evidence last
 
@@ -361,7 +363,7 @@ class Search:
         contacts = self.pairs.contacts[pair]
         return Grasp(
             T_world_tcp=T,
-            width=float(self.pairs.width[pair]),
+            width=self._closed_width(scored.hands, k),
             opening=float(scored.hands.opening[k]),
             contacts=contacts,
             normals=self.pairs.normals[pair],
@@ -375,6 +377,13 @@ class Search:
             if self.measured is None
             else contact_distances(self.pairs.contacts[pair], self.measured),
         )
+
+    def _closed_width(self, hands: Hands, k: int) -> float:
+        """Return the distance of the pads when they touch: that of the contacts, or wider by measured depth [m]."""
+        planned = float(self.pairs.width[hands.pair[k]])
+        if self.measured is None:
+            return planned
+        return max(planned, float(closed_width(hands.select(np.array([k])), self.measured, self.s.hand)[0]))
 
     def _approach(self, T: Array) -> str:
         z = T[:3, 2]
@@ -391,6 +400,12 @@ class Search:
         own = self.s.scene.model.select(torch.from_numpy(self.target.rows))
         around = around_target(self.s.scene, self.target.rows)
         return around, self.s.collision_field(around), self.s.collision_field(own)
+
+    def _by_evidence(self, grasps: Sequence[Grasp]) -> tuple[tuple[Grasp, ...], tuple[Grasp, ...]]:
+        """Split grasps into those to offer, and those without a contact at measured depth."""
+        doubtful = [bool(g.implied) and all(g.implied) and not self.o.accept_implied for g in grasps]
+        kept = tuple(g for g, doubt in zip(grasps, doubtful, strict=True) if not doubt)
+        return kept, tuple(replace(g, rejected=_doubt(g)) for g, doubt in zip(grasps, doubtful, strict=True) if doubt)
 
     def _notes(self, grasps: Sequence[Grasp]) -> tuple[str, ...]:
         notes = []
@@ -414,13 +429,6 @@ class Search:
                 f"{opens:.0f} mm."
             )
         return tuple(notes)
-
-
-def _by_evidence(grasps: Sequence[Grasp]) -> tuple[tuple[Grasp, ...], tuple[Grasp, ...]]:
-    """Split grasps into those with a contact at measured depth, or that were not checked, and those without."""
-    doubtful = tuple(grasp for grasp in grasps if grasp.implied and all(grasp.implied))
-    kept = tuple(grasp for grasp in grasps if not (grasp.implied and all(grasp.implied)))
-    return kept, tuple(replace(grasp, rejected=_doubt(grasp)) for grasp in doubtful)
 
 
 def _doubt(grasp: Grasp) -> str:

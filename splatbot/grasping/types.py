@@ -19,7 +19,8 @@ class Grasp:
 
     Args:
         T_world_tcp: (4, 4) pose of the tool; z is the approach direction, the fingers close along y.
-        width: distance between the contacts [m].
+        width: distance of the pads when they touch the object [m]. It is that of the contacts, or wider where measured
+            depth stands out under a pad.
         opening: finger opening during the approach [m].
         contacts: (2, 3) contact points [m, world].
         normals: (2, 3) outward surface normals at the contacts [world].

@@ -15,7 +15,8 @@ from splatbot.collision.visibility import DepthView
 from splatbot.geometry import look_at, se3_exp, transform_points
 from splatbot.grasping.advice import first_change
 from splatbot.grasping.hands import Hands
-from splatbot.grasping.measured import CONSTANTS, RawDepth, contact_distances, hand_penetration
+from splatbot.grasping.measured import CONSTANTS, RawDepth, closed_width, contact_distances, hand_penetration
+from splatbot.grasping.options import GraspOptions
 from splatbot.grasping.sampler import GraspSampler
 from splatbot.grasping.summary import summary
 from splatbot.grasping.types import GraspResult, NoGraspError
@@ -86,6 +87,18 @@ def test_penetration_equals_the_distance_from_the_nearest_face_in_float64(seed: 
     assert got[0] == pytest.approx(by_boxes(local, opening, HAND, retreat), abs=2e-6)  # float32 at 2 m
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_fingers_stop_where_a_point_would_be_deeper_than_the_tolerance(seed: int) -> None:
+    assert HAND is not None
+    rng = np.random.default_rng(seed)
+    T = se3_exp(np.r_[rng.uniform(-2, 2, 3), rng.uniform(-1.5, 1.5, 3)])
+    local = rng.uniform((-0.02, -0.03, -0.04), (0.02, 0.03, 0.02), (60, 3))
+    at = hands_at(T, 0.08)
+    width = float(closed_width(at, transform_points(T, local), HAND)[0])
+    assert by_boxes(local, width, HAND, 0.0) <= CONSTANTS.max_penetration + 2e-6
+    assert by_boxes(local, width - 1e-4, HAND, 0.0) > CONSTANTS.max_penetration
+
+
 def test_depth_between_the_pads_and_no_depth_at_all_are_no_penetration() -> None:
     assert HAND is not None
     T = np.eye(4)
@@ -97,8 +110,7 @@ def test_depth_between_the_pads_and_no_depth_at_all_are_no_penetration() -> None
 
 def test_confirmed_points_are_on_the_surface_and_dense() -> None:
     low, high = np.array([0.36, 0.0, -0.01]), np.array([0.56, 0.2, 0.14])
-    options = {"floor": FLOOR, "quad": QUAD, "spacing": 0.002}
-    points = confirmed_near(views(TABLE, BOX), low, high, most=60_000, **options)
+    points = confirmed_near(views(TABLE, BOX), low, high, floor=FLOOR, quad=QUAD, spacing=0.002, most=60_000)
     assert ((points > low) & (points < high)).all()
     away = np.minimum(np.abs(BOX.distance(points)), np.abs(TABLE.distance(points)))
     assert away.max() < 3 * (FLOOR + QUAD)
@@ -107,7 +119,7 @@ def test_confirmed_points_are_on_the_surface_and_dense() -> None:
     top = np.c_[np.stack([u.ravel(), v.ravel()], axis=1) @ turn.T + [0.45, 0.10], np.full(u.size, 0.12)]
     assert np.abs(BOX.distance(top)).max() < 1e-9
     assert contact_distances(top, points).max() < 0.003
-    assert len(confirmed_near(views(TABLE, BOX), low, high, most=500, **options)) <= 500
+    assert len(confirmed_near(views(TABLE, BOX), low, high, floor=FLOOR, quad=QUAD, spacing=0.002, most=500)) <= 500
 
 
 def test_two_frames_confirm_nothing() -> None:
@@ -170,4 +182,10 @@ def test_grasps_without_any_contact_at_measured_depth_are_not_offered_but_named(
     assert doubtful[0]["rejected"] == "has no contact at measured depth, and there is none near"
     reason, change = first_change(result, scene(), 0.08)
     assert reason == "10 grasps fit the map, but none has a contact at measured depth"
-    assert change == "map it again from more sides"
+    assert change == "map it again from more sides, or allow such grasps (--accept-implied)"
+    allowed = GraspSampler(scene(), panda(), raw=RawDepth((), FLOOR, QUAD), hand_only=True).sample(
+        target_of(scene(), BOX, "box"), GraspOptions(accept_implied=True)
+    )
+    assert len(allowed.grasps) == 10
+    assert all(g.implied == (True, True) for g in allowed.grasps)
+    assert not allowed.doubtful
