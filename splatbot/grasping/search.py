@@ -434,7 +434,7 @@ class Search:
 def _doubt(grasp: Grasp) -> str:
     assert grasp.depth_distance is not None
     if np.isinf(grasp.depth_distance).any():
-        return "has no contact at measured depth, and there is none near"
+        return "has no contact at measured depth, nor any depth near it"
     away = " and ".join(f"{1e3 * value:.0f}" for value in grasp.depth_distance)
     return f"has no contact at measured depth, which is {away} mm away"
 

@@ -57,5 +57,5 @@ def _grasp_summary(grasp: Grasp) -> dict[str, Any]:
 
 
 def _finite(values: Array | None) -> list[float | None] | None:
-    """Return values as JSON numbers, null for infinity; None if there are none."""
+    """Return values as JSON numbers, null for infinity; None stays None."""
     return None if values is None else [float(value) if np.isfinite(value) else None for value in values]

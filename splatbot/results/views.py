@@ -63,7 +63,9 @@ def subsampled_views(run: RunFolder, log: Log) -> tuple[DepthView, ...]:
     return tuple(subsampled(view) for view in _views(run, log, poses, _spread(sorted(poses))))
 
 
-def raw_views(run: RunFolder, log: Log) -> tuple[list[int], tuple[DepthView, ...]]:
+def raw_views(
+    run: RunFolder, log: Log, most: int = CONSTANTS.max_frames_in_memory
+) -> tuple[list[int], tuple[DepthView, ...]]:
     """Return the frames of :func:`subsampled_views` with all depth that the sensor gave outside of masks, rectified.
 
     An audit must not use the filters of mapping: they remove thin objects as noise. Depth of another time than the pose
@@ -77,7 +79,7 @@ def raw_views(run: RunFolder, log: Log) -> tuple[list[int], tuple[DepthView, ...
         LogError: the log is damaged.
     """
     poses = run.load_poses()
-    indices, rectified = _spread(sorted(poses)), _rectified(run, log)
+    indices, rectified = _spread(sorted(poses), most), _rectified(run, log)
     views = []
     for index in indices:
         frame = rectified[index]
@@ -99,9 +101,9 @@ def subsampled(view: DepthView) -> DepthView:
     return kept, small, T
 
 
-def _spread(indices: Sequence[int]) -> list[int]:
-    """Return at most 40 evenly spaced ones of ``indices``."""
-    count = min(CONSTANTS.max_frames_in_memory, len(indices))
+def _spread(indices: Sequence[int], most: int = CONSTANTS.max_frames_in_memory) -> list[int]:
+    """Return at most ``most`` evenly spaced ones of ``indices``."""
+    count = min(most, len(indices))
     return [indices[k] for k in np.linspace(0, len(indices) - 1, count).round().astype(int)]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
 from tyro.conf import arg
@@ -22,14 +23,19 @@ class GraspingSettings(Settings):
     varies the size of the map and the number of samples. It also measures the distance of contacts to the true
     surfaces, and the angle between the true normals and the line through the contacts.
 
+    With runs, it samples grasps of every object of their maps instead. It compares hands and contacts with raw depth
+    of more frames than the sampler used.
+
     Examples:
         splatbot bench grasping
         splatbot bench grasping --gaussians 150000 --samples 400 3200
         splatbot bench grasping --quick --json figures.json
+        splatbot bench grasping --run runs/desk runs/shelf
 
     Args:
         gaussians: Sizes of the maps. Samples are varied on the first.
         samples: Numbers of seeds on the surface of an object.
+        run: Folders of runs with a scene.yaml.
     """
 
     name: ClassVar[str] = "grasping"
@@ -37,6 +43,7 @@ class GraspingSettings(Settings):
 
     gaussians: Annotated[tuple[int, ...], arg(metavar="N ...")] = (50_000, 10_000, 150_000)
     samples: Annotated[tuple[int, ...], arg(metavar="N ...")] = (50, 100, 200, 400, 800, 1600)
+    run: Annotated[tuple[Path, ...], arg(metavar="RUN ...")] = ()
 
     def validate(self) -> None:
         """Raise an InputError for numbers below 1."""
@@ -45,6 +52,10 @@ class GraspingSettings(Settings):
 
 
 def _measure(settings: GraspingSettings, report_progress: ReportProgress) -> Results:
+    if settings.run:
+        from splatbot.bench.grasping.recorded import run_recorded
+
+        return run_recorded(settings, report_progress)
     from splatbot.bench.grasping.accuracy import run_grasping
 
     return run_grasping(settings, report_progress)
@@ -56,5 +67,6 @@ BENCHMARK = Benchmark(
     tables=(
         Table("By size of the map", lambda row: "Gaussians" in row.case, layout=per_metric),
         Table("By samples", lambda row: "samples" in row.case, layout=per_metric),
+        Table("Maps of recordings", lambda row: "/" in row.case, layout=per_metric),
     ),
 )

@@ -179,7 +179,7 @@ def test_grasps_without_any_contact_at_measured_depth_are_not_offered_but_named(
     assert len(doubtful) == 10
     assert doubtful[0]["contact_implied"] == [True, True]
     assert doubtful[0]["contact_depth_distance_m"] == [None, None]
-    assert doubtful[0]["rejected"] == "has no contact at measured depth, and there is none near"
+    assert doubtful[0]["rejected"] == "has no contact at measured depth, nor any depth near it"
     reason, change = first_change(result, scene(), 0.08)
     assert reason == "10 grasps fit the map, but none has a contact at measured depth"
     assert change == "map it again from more sides, or allow such grasps (--accept-implied)"
