@@ -79,23 +79,23 @@ def panda() -> RobotModel:
         )
         for k in range(7)
     )
-    T_link_hand, body = _turned(_HAND_YAW, _FLANGE), load_body("panda")
+    body = load_body("panda")
     return RobotModel(
         name="panda",
         joints=joints,
-        shapes=(*_arm_shapes(), *_hand_shapes(T_link_hand)),
-        T_link_tcp=T_link_hand @ _turned(0.0, _TCP),
+        shapes=(*_arm_shapes(), *_hand_shapes(T_LINK_HAND)),
+        T_link_tcp=T_LINK_HAND @ _turned(0.0, _TCP),
         home=np.array(_HOME),
         inertials=tuple(Inertial(m, c, _symmetric(i)) for m, c, i in _INERTIALS),
         gripper=GripperGeometry(
-            np.stack([T_link_hand @ _turned(yaw, _FINGERS) for yaw in (0.0, np.pi)]),
+            np.stack([T_LINK_HAND @ _turned(yaw, _FINGERS) for yaw in (0.0, np.pi)]),
             0.04,
             (Capsule(0, (0.0, 0.0125, 0.0), (0.0, 0.0125, 0.0413), 0.0125),),
             covering=body.on("finger", 0),
             hand=_HAND,
         ),
         slack=body.slack,
-        covering=joined(*arm_spheres(), body.on("hand", 7, T_link_hand)),
+        covering=joined(*arm_spheres(), body.on("hand", 7, T_LINK_HAND)),
         pairs=np.array(PAIRS, dtype=np.int32),
     )
 
@@ -152,3 +152,7 @@ def _turned(yaw: float, z: float) -> Array:
 def _symmetric(i: tuple[float, ...]) -> Array:
     xx, yy, zz, xy, xz, yz = i
     return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+
+T_LINK_HAND = _turned(_HAND_YAW, _FLANGE)
+"""Pose (4, 4) of the hand on the last link [m]."""

@@ -125,7 +125,7 @@ def plan(
         "plan.html": plan_html(model, found.planner.arm, field, trajectory, title=title),
     }
     writers = {name: write_text(text) for name, text in texts.items()}
-    replace_files(folder, writers | {"plan.png": write_bytes(plan_png(model, found.planner.arm, trajectory))})
+    replace_files(folder, writers | {"plan.png": write_bytes(plan_png(model, found.planner.arm, arm, trajectory))})
     _print(result, trajectory, covers, folder)
     return 0
 

@@ -34,8 +34,8 @@ class Grasp:
         approach_path: (K, J) straight path from the pre-grasp to the grasp. It is certified against the map without
             the target.
         rejected: reason for which the grasp is rejected; empty for an accepted grasp.
-        depth_distance: (2,) distance of each contact from the nearest confirmed point of raw depth [m], inf if there are
-            no such points near the target. If None, it was not checked.
+        depth_distance: (2,) distance of each contact from the nearest confirmed point of raw depth [m], inf without
+            such points near the target. If None, it was not checked.
     """
 
     T_world_tcp: Array

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from splatbot.camera import Camera
@@ -13,9 +15,11 @@ from splatbot.gaussians import GaussianModel
 from splatbot.geometry import inverse, look_at, transform_points
 from splatbot.planning import JointTrajectory
 from splatbot.protocols import Array
-from splatbot.rasterize.views import render_view, to_png
+from splatbot.rasterize.views import to_png
 from splatbot.report.moving_page import bytes_of, evenly_spaced, moving_page, packed
-from splatbot.report.sphere_gaussians import sphere_gaussians
+from splatbot.report.robot_drawing import draw_robot, map_view
+from splatbot.robots.appearance import appearance
+from splatbot.robots.robot import RobotModel
 
 
 @dataclass(frozen=True)
@@ -27,17 +31,20 @@ class PlanPageConstants:
         crop_radius: [m] radius of the map around the base that is shown.
         frames: postures of the animation.
         ghosts: postures in the image.
+        legend: [px] height of a line of the image's legend.
     """
 
     max_points: int = 40_000
     crop_radius: float = 1.6
     frames: int = 80
     ghosts: int = 5
+    legend: int = 28
 
 
 CONSTANTS = PlanPageConstants()
 
 
+_START, _END = np.array([0.15, 0.45, 0.9]), np.array([0.95, 0.5, 0.1])  # tints of the ends
 _EYE, _TARGET = np.array([-0.9, 1.3, 1.2]), np.array([0.4, 0.0, 0.2])  # camera of the image, in the base frame [m]
 
 
@@ -82,24 +89,50 @@ def plan_html(
     return moving_page(title, facts, document, "plan_view.js")
 
 
-def plan_png(model: GaussianModel, arm: RobotSpheres, trajectory: JointTrajectory, *, width: int = 960) -> bytes:
-    """Render the map with the arm at the start (blue), at the end (orange) and in between."""
-    times = np.linspace(0.0, trajectory.duration, CONSTANTS.ghosts)
-    centers = arm.centers(trajectory.at(times).position)
-    share = np.linspace(0.0, 1.0, CONSTANTS.ghosts)[:, None]
-    hues = (1 - share) * np.array([0.15, 0.45, 0.9]) + share * np.array([0.95, 0.5, 0.1])
-    ghosts = [
-        sphere_gaussians(centers[i], arm.spheres.radii, hues[i], 0.95 if i in (0, CONSTANTS.ghosts - 1) else 0.35)
-        for i in range(CONSTANTS.ghosts)
-    ]
-    near = _within(model, inverse(arm.T_world_base))
-    import torch
+def plan_png(
+    model: GaussianModel,
+    arm: RobotSpheres,
+    robot: RobotModel,
+    trajectory: JointTrajectory,
+    *,
+    opening: float | None = None,
+    width: int = 960,
+) -> bytes:
+    """Render the map with the arm at the start (blue), at the end (orange) and in between (transparent).
 
-    scene = GaussianModel.concatenate([model.select(torch.from_numpy(near)), *ghosts])
+    Args:
+        model: the map.
+        arm: collision spheres of the robot with the pose of its base.
+        robot: the robot.
+        trajectory: the planned trajectory.
+        opening: distance between the fingers [m]; None opens them fully.
+        width: of the image [px]; the height is 3/4 of it.
+    """
+    times = np.linspace(0.0, trajectory.duration, CONSTANTS.ghosts)
+    near = _within(model, inverse(arm.T_world_base))
     camera = Camera(0.9 * width, 0.9 * width, (width - 1) / 2, (width * 3 // 4 - 1) / 2, width, width * 3 // 4)
-    return to_png(
-        render_view(scene, camera, arm.T_world_base @ look_at(_EYE, _TARGET), background=(0.09, 0.1, 0.12)), "rgb"
-    )
+    T_world_camera = arm.T_world_base @ look_at(_EYE, _TARGET)
+    view, depth = map_view(model.select(torch.from_numpy(near)), camera, T_world_camera)
+    parts = appearance(robot, opening)
+    links = arm.T_world_base @ robot.fk(trajectory.at(times).position)
+    last = CONSTANTS.ghosts - 1
+    for k in (0, last, *range(1, last)):  # the ends first, because they hide and are hidden
+        share = k / last
+        draw_robot(
+            view,
+            depth,
+            camera,
+            T_world_camera,
+            parts,
+            links[k],
+            tint=(1 - share) * _START + share * _END,
+            opacity=1.0 if k in (0, last) else 0.3,
+        )
+    for row, (text, color) in enumerate((("start", _START), ("goal", _END))):
+        place = (CONSTANTS.legend, CONSTANTS.legend * (row + 1))
+        shade = tuple(float(value) for value in 0.4 + 0.6 * color)
+        cv2.putText(view, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.7, shade, 2, cv2.LINE_AA)
+    return to_png(view, "rgb")
 
 
 def _within(model: GaussianModel, T_base_world: Array) -> NDArray[np.int64]:

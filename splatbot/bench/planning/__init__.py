@@ -39,13 +39,13 @@ class PlanningSettings(Settings):
         problems: Number of problems.
         seeds: Seeds of each problem, for budgets up to 100 ms; longer budgets use one.
         mapped: Plan on the map that SLAM builds from a noisy film of the table top instead (minutes).
-        run: Run folders of splatbot map: plan ten problems in each map instead, or in addition with --mapped. The
+        run: Run folders of splatbot map: plan problems in each map instead, or in addition with --mapped. The
             scene.yaml of the log places the arm.
         margins: Also sweep the margin on each run: missed surface, false hits and solved problems, with a plot.
         gaussians: Gaussians of the map.
         peer_budgets: Time budgets [ms] of peers that improve a path until the time is over.
         film: Frames of the noisy film, and the width of its images [px].
-        run_problems: Problems in the map of each run.
+        run_problems: Number of problems in the map of each run.
     """
 
     name: ClassVar[str] = "planning"
@@ -69,7 +69,7 @@ class PlanningSettings(Settings):
     gaussians: Suppress[int] = 50_000
     peer_budgets: Suppress[tuple[float, ...]] = (28.0, 100.0, 1000.0)
     film: Suppress[tuple[int, int]] = (120, 320)
-    run_problems: Suppress[int] = 10
+    run_problems: int = 100
 
     def validate(self) -> None:
         """Raise an InputError for options that exclude each other, and for numbers that are not positive."""

@@ -1,0 +1,143 @@
+"""Appearance of arms in pictures: triangles of links and fingers with their colours.
+
+The Panda's are Franka's visual meshes (Apache-2.0), simplified. Other robots show the shapes of the twin, and without
+these the spheres of their certified body. Pictures alone use them; no check does.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import open3d as o3d
+import trimesh
+
+from splatbot.atomic import atomic_write
+from splatbot.errors import FormatError
+from splatbot.geometry import transform_points
+from splatbot.protocols import Array
+from splatbot.robots.maker_meshes import SOURCES, Source
+from splatbot.robots.panda import T_LINK_HAND
+from splatbot.robots.robot import RobotModel
+
+_FILE = Path(__file__).parent / "bodies" / "panda_appearance.npz"
+_STEP = 1e-5  # [m] resolution of the stored corners
+_TRIANGLES = 1500  # of a part, at most
+_LIGHT, _DARK = (0.90, 0.90, 0.91), (0.30, 0.31, 0.33)
+_GREY = (200, 200, 200)  # of a mesh without a material
+
+Color = tuple[float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """Triangles (T, 3, 3) [m, link frame] that move with a link, and their colour (3,) in 0..1."""
+
+    link: int
+    triangles: Array
+    color: Color
+
+
+def appearance(robot: RobotModel, opening: float | None = None) -> list[Part]:
+    """Return the parts of a robot with ``opening`` [m] between its fingers; None opens them fully.
+
+    Raises:
+        FormatError: the stored meshes are damaged.
+    """
+    last, meshes = len(robot), _panda_meshes() if robot.name.split("-")[0] == "panda" else {}
+    parts = [replace(piece, link=k) for k in range(last + 1) for piece in meshes.get(f"link{k}", ())]
+    if robot.name == "panda":
+        parts += [
+            replace(piece, link=last, triangles=transform_points(T_LINK_HAND, piece.triangles))
+            for piece in meshes["hand"]
+        ]
+        fingers = ((piece.triangles, piece.color) for piece in meshes["finger"])
+        return parts + [part for triangles, color in fingers for part in _fingers(robot, triangles, color, opening)]
+    drawn = {part.link for part in parts} - {last}  # a hand on the last link is not the Panda's own
+    shapes = [Part(shape.link, shape.triangles(), _DARK) for shape in robot.shapes if shape.link not in drawn]
+    if robot.gripper is not None and robot.gripper.shapes:
+        own = np.concatenate([shape.triangles() for shape in robot.gripper.shapes])
+        shapes += _fingers(robot, own, _DARK, opening)
+    if shapes:
+        return parts + shapes
+    spheres = robot.spheres(opening)
+    return [
+        Part(int(link), np.asarray(center + radius * _ball()), _LIGHT)
+        for link, center, radius in zip(spheres.link, spheres.centers, spheres.radii, strict=True)
+    ]
+
+
+def _fingers(robot: RobotModel, triangles: Array, color: Color, opening: float | None) -> list[Part]:
+    """Return both fingers in the frame of the last link, from the triangles of one in its own frame."""
+    assert robot.gripper is not None
+    aside = robot.gripper.stroke if opening is None else opening / 2
+    moved = triangles + np.array([0.0, aside, 0.0])
+    return [Part(len(robot), transform_points(T, moved), color) for T in robot.gripper.T_link_finger]
+
+
+@cache
+def _ball() -> Array:
+    mesh = o3d.geometry.TriangleMesh.create_icosahedron()
+    mesh = mesh.subdivide_loop(2)
+    corners = np.asarray(mesh.vertices)
+    corners = corners / np.linalg.norm(corners, axis=1, keepdims=True)
+    return np.asarray(corners[np.asarray(mesh.triangles)])
+
+
+@cache
+def _panda_meshes() -> dict[str, list[Part]]:
+    """Return the pieces of each part of the Panda in its own frame; their link is 0."""
+    found: dict[str, list[Part]] = {}
+    try:
+        with np.load(_FILE) as stored:
+            for name in stored.files:
+                if name.count("/") == 1:
+                    triangles = _STEP * stored[name].astype(np.float64)[stored[f"{name}/faces"]]
+                    red, green, blue = (float(value) / 255 for value in stored[f"{name}/color"])
+                    found.setdefault(name.split("/")[0], []).append(Part(0, triangles, (red, green, blue)))
+    except (OSError, ValueError, KeyError) as error:
+        raise FormatError(f"holds no meshes ({error}).", file=_FILE, hint="install splatbot again") from error
+    return found
+
+
+def save_appearance(source: Source, path: Path) -> None:
+    """Simplify the visual meshes of a source by quadric decimation (Garland and Heckbert 1997), and store them.
+
+    Faces of one colour are simplified together.
+
+    Raises:
+        InputError: the meshes are not installed.
+    """
+    stored = {}
+    for part, files in source.parts.items():
+        scene = trimesh.load_scene(source.path(files[0]), process=False)
+        unit = trimesh.units.unit_conversion(scene.units, "meters") if scene.units else 1.0
+        pieces = [piece for piece in scene.dump() if isinstance(piece, trimesh.Trimesh)]
+        total = sum(len(piece.faces) for piece in pieces)
+        by_color: dict[tuple[int, ...], list[trimesh.Trimesh]] = {}
+        for piece in pieces:
+            diffuse = np.asarray(getattr(getattr(piece.visual, "material", None), "main_color", _GREY))[:3]
+            by_color.setdefault(tuple(int(value) for value in diffuse), []).append(piece)
+        for k, (color, same) in enumerate(by_color.items()):
+            joined = trimesh.util.concatenate(same)
+            assert isinstance(joined, trimesh.Trimesh)
+            mesh = o3d.geometry.TriangleMesh(
+                o3d.utility.Vector3dVector(unit * joined.vertices), o3d.utility.Vector3iVector(joined.faces)
+            )
+            mesh = mesh.merge_close_vertices(_STEP).remove_degenerate_triangles()
+            most = max(60, _TRIANGLES * len(joined.faces) // total)
+            if len(mesh.triangles) > most:
+                mesh = mesh.simplify_quadric_decimation(most)
+            mesh.remove_unreferenced_vertices()
+            name = f"{part}/{k}"
+            stored[name] = np.rint(np.asarray(mesh.vertices) / _STEP).astype(np.int32)
+            stored[f"{name}/faces"] = np.asarray(mesh.triangles).astype(np.uint16)
+            stored[f"{name}/color"] = np.array(color, np.uint8)
+    with atomic_write(path) as file:
+        np.savez_compressed(file, allow_pickle=False, **stored)
+
+
+if __name__ == "__main__":
+    save_appearance(SOURCES["panda"], _FILE)
