@@ -220,6 +220,9 @@ class GraspsRequest(Request):
     base: Pose | None = Field(None, description="T_world_base, z up; by default that of the map")
     hand_only: bool = Field(False, description="leave the arm out")
     approach: Literal["any", "top", "side"] = "any"
+    min_confidence: Annotated[float, Field(ge=0, le=1)] = Field(
+        0.5, description="least probability of success of a grasp, as simulated trials calibrate it"
+    )
     accept_implied: bool = Field(False, description="offer grasps of which no contact is at measured depth")
     friction: Annotated[float, Field(gt=0, le=2)] = 0.5
     samples: Annotated[int, Field(ge=10, le=5000)] = Field(

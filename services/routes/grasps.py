@@ -64,6 +64,7 @@ def grasps(request: Request, served: ServedAfterFrames, service: Service, query:
         samples=query.samples,
         wanted=query.wanted,
         approach=query.approach,
+        min_confidence=query.min_confidence,
         accept_implied=query.accept_implied,
         seed=query.seed,
     )

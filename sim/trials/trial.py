@@ -170,7 +170,7 @@ def pick_with(stack: Stack, trial: TrialScene, seen: TrialScan, *, videos: Path 
         return _row(stack, trial, scan, known, None, None, both, both)
     results = []
     mistaken = _mistaken(known, decision.target, trial)
-    for twin in (Twin(trial.scene), _held_out_twin(trial)):
+    for twin in (Twin(trial.scene), held_out_twin(trial)):
         results.append(attempt(decision, trial, twin, mistaken=mistaken))
     (ideal, first), (held_out, _) = results
     if videos is not None and not held_out.success:
@@ -239,13 +239,14 @@ class _Watched(TwinController):
         return tuple(sorted({contact.other for contact in self._contacts.found} & names))
 
 
-def _held_out_twin(trial: TrialScene) -> HeldOutTwin:
+def held_out_twin(trial: TrialScene) -> HeldOutTwin:
+    """Return the twin of a scene with other friction, masses, gains and delays, and all effects."""
     return HeldOutTwin(trial.scene, draw(Spread(), trial.seed))
 
 
 def _film(decision: StackDecision, trial: TrialScene, path: Path) -> None:
     """Record the pick in the held-out twin again, with a camera."""
-    twin = _held_out_twin(trial)
+    twin = held_out_twin(trial)
     video = Video(path, TwinCamera(twin.world, seed=trial.seed))
     try:
         attempt(decision, trial, twin, watch=video)

@@ -38,6 +38,7 @@ def grasp(
     base: Annotated[Pose | None, tyro.conf.arg(metavar="X Y Z QW QX QY QZ")] = None,
     hand_only: bool = False,
     approach: Literal["any", "top", "side"] = "any",
+    min_confidence: float = 0.5,
     accept_implied: bool = False,
     friction: float = 0.5,
     samples: int = 400,
@@ -78,6 +79,7 @@ def grasp(
             `splatbot info --fit-plane`).
         hand_only: ignore the arm and its reachability.
         approach: direction of the approach.
+        min_confidence: least probability of success 0..1 of a grasp, as simulated trials calibrate it.
         accept_implied: offer grasps of which no contact is at measured depth; such sides follow from the visible ones.
         friction: friction coefficient between finger pads and object.
         samples: sampled surface points, which determine the time. Without a result, four times as many are tried.
@@ -117,6 +119,7 @@ def grasp(
         pregrasp=pregrasp,
         wanted=wanted,
         approach=approach,
+        min_confidence=min_confidence,
         accept_implied=accept_implied,
         seed=seed,
     )
@@ -243,13 +246,13 @@ def _print(result: GraspResult, folder: Path) -> None:
     terms = list(result.grasps[0].terms)
     contacts = ["contacts"] if result.grasps[0].implied else []
     table = Table()
-    for name in ("", "total", "approach", "width, mm", "opens, mm", "clearance, mm", *contacts, *terms):
+    for name in ("", "total", "confidence", "approach", "width, mm", "opens, mm", "clearance, mm", *contacts, *terms):
         table.add_column(name, justify="left" if name == "approach" else "right")
     for k, g in enumerate(result.grasps):
         lengths = (f"{1e3 * value:.1f}" for value in (g.width, g.opening, g.clearance))
         contact = [" and ".join("implied" if each else "measured" for each in g.implied)] if contacts else []
         values = (f"{g.terms[name]:.2f}" for name in terms)
-        table.add_row(str(k), f"{g.total:.3f}", g.approach, *lengths, *contact, *values)
+        table.add_row(str(k), f"{g.total:.3f}", f"{g.confidence:.2f}", g.approach, *lengths, *contact, *values)
     print_columns(table)
     print("the best total and the best value of a term is 1")
     if contacts:

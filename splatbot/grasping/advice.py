@@ -55,7 +55,10 @@ def first_change(result: GraspResult, scene: SegmentedMap, stroke: float) -> tup
         stroke: widest opening of the hand [m].
     """
     if result.doubtful:
-        why = f"{len(result.doubtful)} grasps fit the map, but none has a contact at measured depth"
+        best = result.doubtful[0]
+        why = f"{len(result.doubtful)} grasps fit the map, but the best of them {best.rejected}"
+        if best.rejected.startswith("has a confidence"):
+            return why, "take another hand, or allow such grasps (--min-confidence)"
         return why, "map it again from more sides, or allow such grasps (--accept-implied)"
     number = result.target.number
     if 0 <= number < len(scene.objects):

@@ -13,6 +13,7 @@ _RANGES = {
     "depths": (1, 20),
     "pregrasp": (0.01, 0.5),
     "wanted": (1, 1000),
+    "min_confidence": (0.0, 1.0),
 }
 APPROACHES = ("any", "top", "side")
 
@@ -30,6 +31,7 @@ class GraspOptions:
         pregrasp: length of the straight approach from the pre-grasp to the grasp [m].
         wanted: maximum number of grasps to return.
         approach: "any", "top" or "side".
+        min_confidence: least confidence 0..1 of a grasp that is offered.
         accept_implied: offer grasps of which no contact is at measured depth. It has no effect without raw depth.
         seed: seed of the random generator.
 
@@ -44,6 +46,7 @@ class GraspOptions:
     pregrasp: float = 0.10
     wanted: int = 10
     approach: str = "any"
+    min_confidence: float = 0.5
     accept_implied: bool = False
     seed: int = 0
 

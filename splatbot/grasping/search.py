@@ -402,10 +402,20 @@ class Search:
         return around, self.s.collision_field(around), self.s.collision_field(own)
 
     def _by_evidence(self, grasps: Sequence[Grasp]) -> tuple[tuple[Grasp, ...], tuple[Grasp, ...]]:
-        """Split grasps into those to offer, and those without a contact at measured depth."""
-        doubtful = [bool(g.implied) and all(g.implied) and not self.o.accept_implied for g in grasps]
-        kept = tuple(g for g, doubt in zip(grasps, doubtful, strict=True) if not doubt)
-        return kept, tuple(replace(g, rejected=_doubt(g)) for g, doubt in zip(grasps, doubtful, strict=True) if doubt)
+        """Split grasps into those to offer, and those that are too doubtful, with the reason."""
+        judged = [replace(grasp, rejected=self._doubt(grasp)) for grasp in grasps]
+        return tuple(g for g in judged if not g.rejected), tuple(g for g in judged if g.rejected)
+
+    def _doubt(self, grasp: Grasp) -> str:
+        """Return why a grasp should not be executed; empty if it may be."""
+        if grasp.confidence < self.o.min_confidence:
+            return f"has a confidence of {grasp.confidence:.2f}, less than {self.o.min_confidence:g}"
+        if self.o.accept_implied or grasp.depth_distance is None or not all(grasp.implied):
+            return ""
+        if np.isinf(grasp.depth_distance).any():
+            return "has no contact at measured depth, nor any depth near it"
+        away = " and ".join(f"{1e3 * value:.0f}" for value in grasp.depth_distance)
+        return f"has no contact at measured depth, which is {away} mm away"
 
     def _notes(self, grasps: Sequence[Grasp]) -> tuple[str, ...]:
         notes = []
@@ -429,14 +439,6 @@ class Search:
                 f"{opens:.0f} mm."
             )
         return tuple(notes)
-
-
-def _doubt(grasp: Grasp) -> str:
-    assert grasp.depth_distance is not None
-    if np.isinf(grasp.depth_distance).any():
-        return "has no contact at measured depth, nor any depth near it"
-    away = " and ".join(f"{1e3 * value:.0f}" for value in grasp.depth_distance)
-    return f"has no contact at measured depth, which is {away} mm away"
 
 
 def _deep(clearance: float) -> str:

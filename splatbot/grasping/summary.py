@@ -48,6 +48,7 @@ def _grasp_summary(grasp: Grasp) -> dict[str, Any]:
         "approach": grasp.approach,
         "terms": dict(grasp.terms),
         "total": grasp.total,
+        "confidence": grasp.confidence,
         "clearance_m": grasp.clearance,
         "q": grasp.q.tolist() if grasp.q is not None else None,
         "q_pregrasp": grasp.q_pregrasp.tolist() if grasp.q_pregrasp is not None else None,

@@ -10,6 +10,7 @@ import numpy as np
 from splatbot.errors import SplatbotError
 from splatbot.grasping.affordance import Target
 from splatbot.grasping.measured import CONSTANTS
+from splatbot.grasping.score import confidence
 from splatbot.protocols import Array
 
 
@@ -55,6 +56,11 @@ class Grasp:
     depth_distance: Array | None = None
 
     @property
+    def confidence(self) -> float:
+        """Return the probability of success 0..1; see :func:`splatbot.grasping.score.confidence`."""
+        return confidence(self.total)
+
+    @property
     def implied(self) -> tuple[bool, ...]:
         """Return for each contact whether no measured depth supports it; empty if that was not checked."""
         if self.depth_distance is None:
@@ -84,8 +90,8 @@ class GraspResult:
         seconds: duration of each stage [s].
         map_version: version of the map that was searched.
         notes: remarks on the result, each a sentence.
-        doubtful: grasps that passed all tests, best first, but have no contact at measured depth. Nothing measured
-            shows that an object is between the fingers, so that they should not be executed.
+        doubtful: grasps that passed all tests, best first, but should not be executed. Their confidence is too small,
+            or no contact is at measured depth, so that nothing measured shows an object between the fingers.
     """
 
     target: Target
@@ -122,7 +128,7 @@ class NoGraspError(SplatbotError):
         counts = ", ".join(f"{count} {reason}" for reason, count in result.rejected.items() if count)
         text = f"cannot be grasped: of {result.candidates} hands and their contacts {counts or 'none was found'}."
         if result.doubtful:
-            text = f"has no grasp that should be executed: {len(result.doubtful)} have no contact at measured depth."
+            text = f"has no grasp that should be executed; {len(result.doubtful)} fit the map."
         if result.notes:
             text += " " + " ".join(result.notes)
         best = result.doubtful[0] if result.doubtful else result.best_rejected

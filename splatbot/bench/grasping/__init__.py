@@ -31,11 +31,15 @@ class GraspingSettings(Settings):
         splatbot bench grasping --gaussians 150000 --samples 400 3200
         splatbot bench grasping --quick --json figures.json
         splatbot bench grasping --run runs/desk runs/shelf
+        splatbot bench grasping --reliability 45
 
     Args:
         gaussians: Sizes of the maps. Samples are varied on the first.
         samples: Numbers of seeds on the surface of an object.
         run: Folders of runs with a scene.yaml.
+        reliability: Number of simulated scenes in which up to five grasps each are executed, to compare confidence and
+            success (half a minute a scene).
+        first: Seed of the first of these scenes.
     """
 
     name: ClassVar[str] = "grasping"
@@ -44,14 +48,22 @@ class GraspingSettings(Settings):
     gaussians: Annotated[tuple[int, ...], arg(metavar="N ...")] = (50_000, 10_000, 150_000)
     samples: Annotated[tuple[int, ...], arg(metavar="N ...")] = (50, 100, 200, 400, 800, 1600)
     run: Annotated[tuple[Path, ...], arg(metavar="RUN ...")] = ()
+    reliability: Annotated[int, arg(metavar="SCENES")] = 0
+    first: Annotated[int, arg(metavar="SEED")] = 400
 
     def validate(self) -> None:
         """Raise an InputError for numbers below 1."""
+        if self.reliability < 0 or self.first < 0:
+            raise InputError("is negative.", field="--reliability, --first", hint="give 0 or more")
         if not self.gaussians or min((*self.gaussians, *self.samples)) < 1:
             raise InputError("has a number below 1.", field="--gaussians, --samples", hint="give positive numbers")
 
 
 def _measure(settings: GraspingSettings, report_progress: ReportProgress) -> Results:
+    if settings.reliability:
+        from splatbot.bench.grasping.reliability import run_reliability
+
+        return run_reliability(settings, report_progress)
     if settings.run:
         from splatbot.bench.grasping.recorded import run_recorded
 
@@ -61,12 +73,21 @@ def _measure(settings: GraspingSettings, report_progress: ReportProgress) -> Res
     return run_grasping(settings, report_progress)
 
 
+def _plot(results: Results, folder: Path) -> None:
+    if any(row.case == "all grasps" for row in results.rows):
+        from splatbot.bench.grasping.reliability import plot_reliability
+
+        plot_reliability(results, folder)
+
+
 BENCHMARK = Benchmark(
     GraspingSettings,
     _measure,
+    plot=_plot,
     tables=(
         Table("By size of the map", lambda row: "Gaussians" in row.case, layout=per_metric),
         Table("By samples", lambda row: "samples" in row.case, layout=per_metric),
+        Table("Reliability", lambda row: "confidence" in row.case or "all " in row.case or "fit" in row.case),
         Table("Maps of recordings", lambda row: "/" in row.case, layout=per_metric),
     ),
 )

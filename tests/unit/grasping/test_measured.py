@@ -18,6 +18,7 @@ from splatbot.grasping.hands import Hands
 from splatbot.grasping.measured import CONSTANTS, RawDepth, closed_width, contact_distances, hand_penetration
 from splatbot.grasping.options import GraspOptions
 from splatbot.grasping.sampler import GraspSampler
+from splatbot.grasping.score import confidence
 from splatbot.grasping.summary import summary
 from splatbot.grasping.types import GraspResult, NoGraspError
 from splatbot.logs.raycast import RaycastScene, RaycastSurface
@@ -173,7 +174,7 @@ def test_results_state_the_support_of_each_contact_and_null_where_it_was_not_che
 def test_grasps_without_any_contact_at_measured_depth_are_not_offered_but_named() -> None:
     result = grasps_with(RawDepth((), FLOOR, QUAD))
     assert not result.grasps
-    with pytest.raises(NoGraspError, match="no grasp that should be executed: 10 have no contact at measured depth"):
+    with pytest.raises(NoGraspError, match="no grasp that should be executed; 10 fit the map"):
         result.unwrap()
     doubtful = summary(result)["doubtful"]
     assert len(doubtful) == 10
@@ -181,7 +182,7 @@ def test_grasps_without_any_contact_at_measured_depth_are_not_offered_but_named(
     assert doubtful[0]["contact_depth_distance_m"] == [None, None]
     assert doubtful[0]["rejected"] == "has no contact at measured depth, nor any depth near it"
     reason, change = first_change(result, scene(), 0.08)
-    assert reason == "10 grasps fit the map, but none has a contact at measured depth"
+    assert reason.startswith("10 grasps fit the map, but the best of them has no contact at measured depth")
     assert change == "map it again from more sides, or allow such grasps (--accept-implied)"
     allowed = GraspSampler(scene(), panda(), raw=RawDepth((), FLOOR, QUAD), hand_only=True).sample(
         target_of(scene(), BOX, "box"), GraspOptions(accept_implied=True)
@@ -189,3 +190,28 @@ def test_grasps_without_any_contact_at_measured_depth_are_not_offered_but_named(
     assert len(allowed.grasps) == 10
     assert all(g.implied == (True, True) for g in allowed.grasps)
     assert not allowed.doubtful
+
+
+def test_grasps_of_less_than_the_least_confidence_are_not_offered_but_named() -> None:
+    target = target_of(scene(), BOX, "box")
+    sampler = GraspSampler(scene(), panda(), hand_only=True)
+    every = sampler.sample(target, GraspOptions(min_confidence=0.0))
+    least = float(np.median([g.confidence for g in every.grasps]))
+    some = sampler.sample(target, GraspOptions(min_confidence=least))
+    assert not every.doubtful
+    assert some.grasps
+    assert some.doubtful
+    assert min(g.confidence for g in some.grasps) >= least > max(g.confidence for g in some.doubtful)
+    assert all(g.rejected.endswith(f"less than {least:g}") for g in some.doubtful)
+    none = sampler.sample(target, GraspOptions(min_confidence=1.0))
+    assert not none.grasps
+    reason, change = first_change(none, scene(), 0.08)
+    assert "has a confidence of" in reason
+    assert change == "take another hand, or allow such grasps (--min-confidence)"
+
+
+def test_confidence_grows_with_the_score_between_0_and_1() -> None:
+    values = [confidence(total) for total in np.linspace(0.0, 1.0, 11)]
+    assert values == sorted(values)
+    assert 0.0 < values[0] < 0.1
+    assert 0.99 < values[-1] < 1.0
