@@ -6,7 +6,7 @@ these the spheres of their certified body. Pictures alone use them; no check doe
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -18,6 +18,7 @@ from splatbot.atomic import atomic_write
 from splatbot.errors import FormatError
 from splatbot.geometry import transform_points
 from splatbot.protocols import Array
+from splatbot.report.robot_drawing import Color, Part
 from splatbot.robots.maker_meshes import SOURCES, Source
 from splatbot.robots.panda import T_LINK_HAND
 from splatbot.robots.robot import RobotModel
@@ -27,17 +28,6 @@ _STEP = 1e-5  # [m] resolution of the stored corners
 _TRIANGLES = 1500  # of a part, at most
 _LIGHT, _DARK = (0.90, 0.90, 0.91), (0.30, 0.31, 0.33)
 _GREY = (200, 200, 200)  # of a mesh without a material
-
-Color = tuple[float, float, float]
-
-
-@dataclass(frozen=True, eq=False)
-class Part:
-    """Triangles (T, 3, 3) [m, link frame] that move with a link, and their colour (3,) in 0..1."""
-
-    link: int
-    triangles: Array
-    color: Color
 
 
 def appearance(robot: RobotModel, opening: float | None = None) -> list[Part]:
@@ -103,7 +93,7 @@ def _panda_meshes() -> dict[str, list[Part]]:
 
 
 def save_appearance(source: Source, path: Path) -> None:
-    """Simplify the visual meshes of a source by quadric decimation (Garland and Heckbert 1997), and store them.
+    """Save the visual meshes of a source, simplified by quadric decimation (Garland and Heckbert 1997).
 
     Faces of one colour are simplified together.
 

@@ -111,6 +111,7 @@ def grasp(
     from splatbot.grasping.summary import summary
     from splatbot.grasping.tags import TagAffordance
     from splatbot.report.grasp_view import grasp_png
+    from splatbot.robots.appearance import appearance
     from splatbot.robots.store import load_robot
 
     options = GraspOptions(
@@ -138,7 +139,8 @@ def grasp(
     shown = next(iter((*result.grasps, *result.doubtful)), result.best_rejected)
     if shown is not None:
         with atomic_write(folder / "grasp.png") as handle:
-            handle.write(grasp_png(scene, found.rows, arm, shown))
+            hand = [part for part in appearance(arm, shown.opening) if part.link == len(arm)]
+            handle.write(grasp_png(scene, found.rows, shown, hand, arm.T_link_tcp))
     if not result.grasps and not verbose:
         reason, change = first_change(result, scene, stroke_of(arm))
         why = " ".join(note for note in found.notes if note.startswith("took "))

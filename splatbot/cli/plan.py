@@ -89,6 +89,7 @@ def plan(
     from splatbot.gaussians import GaussianModel
     from splatbot.planning import GaussianRRTStar, PoseGoal
     from splatbot.report.plan_page import plan_html, plan_png
+    from splatbot.robots.appearance import appearance
     from splatbot.robots.store import load_robot
 
     arm = load_robot(robot)
@@ -125,7 +126,8 @@ def plan(
         "plan.html": plan_html(model, found.planner.arm, field, trajectory, title=title),
     }
     writers = {name: write_text(text) for name, text in texts.items()}
-    replace_files(folder, writers | {"plan.png": write_bytes(plan_png(model, found.planner.arm, arm, trajectory))})
+    picture = plan_png(model, found.planner.arm, trajectory, appearance(arm), arm.fk)
+    replace_files(folder, writers | {"plan.png": write_bytes(picture)})
     _print(result, trajectory, covers, folder)
     return 0
 

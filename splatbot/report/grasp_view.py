@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,11 +14,10 @@ from splatbot.gaussians import GaussianModel
 from splatbot.gaussians.harmonics import rgb_to_sh
 from splatbot.geometry import inverse, look_at, transform_points
 from splatbot.grasping.types import Grasp
+from splatbot.protocols import Array
 from splatbot.rasterize.views import to_png
-from splatbot.report.robot_drawing import draw_robot, map_view
+from splatbot.report.robot_drawing import Part, draw_robot, map_view
 from splatbot.report.sphere_gaussians import sphere_gaussians
-from splatbot.robots.appearance import Part, appearance
-from splatbot.robots.robot import RobotModel
 from splatbot.segmentation import SegmentedMap
 
 _CONTACT, _TARGET = np.array([0.1, 0.9, 0.2]), np.array([0.95, 0.5, 0.1])
@@ -45,8 +45,9 @@ _SIDES = (np.array([-0.8, 0.35, 0.6]), np.array([-0.25, -0.9, 0.45]))  # camera 
 def grasp_png(
     scene: SegmentedMap,
     rows: NDArray[np.int64],
-    robot: RobotModel,
     grasp: Grasp,
+    hand: Sequence[Part],
+    T_link_tcp: Array,
     *,
     width: int = 1280,
     height: int = 480,
@@ -56,36 +57,31 @@ def grasp_png(
     Args:
         scene: the map.
         rows: (M,) indices of the target's Gaussians.
-        robot: robot with a hand.
         grasp: the grasp to draw.
+        hand: appearance of the last link with its hand.
+        T_link_tcp: (4, 4) pose of the tool on the last link [m].
         width, height: of both views together [px].
     """
     model = _tinted(scene.model, rows)
     middle = grasp.contacts.mean(axis=0)
     near = np.linalg.norm(model.means.double().numpy() - middle, axis=1) < CONSTANTS.crop_radius
-    parts = [model.select(torch.from_numpy(np.flatnonzero(near)))]
-    parts.append(sphere_gaussians(grasp.contacts, np.full(2, 0.006), _CONTACT, 0.95))
+    drawn = [model.select(torch.from_numpy(np.flatnonzero(near)))]
+    drawn.append(sphere_gaussians(grasp.contacts, np.full(2, 0.006), _CONTACT, 0.95))
     steps = np.linspace(0.004, 0.03, 8)[:, None]
     for contact, normal in zip(grasp.contacts, grasp.normals, strict=True):
-        parts.append(sphere_gaussians(contact + steps * normal, np.full(8, 0.0025), _CONTACT, 0.95))
-    drawn = GaussianModel.concatenate(parts)
-    hand = _hand(robot, grasp.opening)
+        drawn.append(sphere_gaussians(contact + steps * normal, np.full(8, 0.0025), _CONTACT, 0.95))
+    parts = [replace(part, link=0) for part in hand]
     half = width // 2
     camera = Camera(0.9 * half, 0.9 * half, (half - 1) / 2, (height - 1) / 2, half, height)
     at = transform_points(inverse(scene.T_world_base), middle)
     views = []
     for side in _SIDES:
         T = scene.T_world_base @ look_at(at + CONSTANTS.camera_distance * side / np.linalg.norm(side), at)
-        view, depth = map_view(drawn, camera, T)
+        view, depth = map_view(GaussianModel.concatenate(drawn), camera, T)
         for T_world_tcp, opacity in ((grasp.T_world_tcp, 1.0), (grasp.T_world_pregrasp, 0.25)):
-            draw_robot(view, depth, camera, T, hand, (T_world_tcp @ inverse(robot.T_link_tcp))[None], opacity=opacity)
+            draw_robot(view, depth, camera, T, parts, (T_world_tcp @ inverse(T_link_tcp))[None], opacity=opacity)
         views.append(view)
     return to_png(np.ascontiguousarray(np.concatenate(views, axis=1)), "rgb")
-
-
-def _hand(robot: RobotModel, opening: float) -> list[Part]:
-    """Return the parts of the last link, as those of link 0."""
-    return [replace(part, link=0) for part in appearance(robot, opening) if part.link == len(robot)]
 
 
 def _tinted(model: GaussianModel, rows: NDArray[np.int64]) -> GaussianModel:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -17,9 +18,7 @@ from splatbot.planning import JointTrajectory
 from splatbot.protocols import Array
 from splatbot.rasterize.views import to_png
 from splatbot.report.moving_page import bytes_of, evenly_spaced, moving_page, packed
-from splatbot.report.robot_drawing import draw_robot, map_view
-from splatbot.robots.appearance import appearance
-from splatbot.robots.robot import RobotModel
+from splatbot.report.robot_drawing import Part, draw_robot, map_view
 
 
 @dataclass(frozen=True)
@@ -92,10 +91,10 @@ def plan_html(
 def plan_png(
     model: GaussianModel,
     arm: RobotSpheres,
-    robot: RobotModel,
     trajectory: JointTrajectory,
+    parts: Sequence[Part],
+    fk: Callable[[Array], Array],
     *,
-    opening: float | None = None,
     width: int = 960,
 ) -> bytes:
     """Render the map with the arm at the start (blue), at the end (orange) and in between (transparent).
@@ -103,9 +102,9 @@ def plan_png(
     Args:
         model: the map.
         arm: collision spheres of the robot with the pose of its base.
-        robot: the robot.
         trajectory: the planned trajectory.
-        opening: distance between the fingers [m]; None opens them fully.
+        parts: appearance of the robot.
+        fk: returns the poses T_base_link (K, L, 4, 4) of its links at joint positions (K, J).
         width: of the image [px]; the height is 3/4 of it.
     """
     times = np.linspace(0.0, trajectory.duration, CONSTANTS.ghosts)
@@ -113,8 +112,7 @@ def plan_png(
     camera = Camera(0.9 * width, 0.9 * width, (width - 1) / 2, (width * 3 // 4 - 1) / 2, width, width * 3 // 4)
     T_world_camera = arm.T_world_base @ look_at(_EYE, _TARGET)
     view, depth = map_view(model.select(torch.from_numpy(near)), camera, T_world_camera)
-    parts = appearance(robot, opening)
-    links = arm.T_world_base @ robot.fk(trajectory.at(times).position)
+    links = arm.T_world_base @ fk(trajectory.at(times).position)
     last = CONSTANTS.ghosts - 1
     for k in (0, last, *range(1, last)):  # the ends first, because they hide and are hidden
         share = k / last
@@ -128,11 +126,12 @@ def plan_png(
             tint=(1 - share) * _START + share * _END,
             opacity=1.0 if k in (0, last) else 0.3,
         )
+    picture = np.rint(255 * np.clip(view, 0.0, 1.0)).astype(np.uint8)
     for row, (text, color) in enumerate((("start", _START), ("goal", _END))):
         place = (CONSTANTS.legend, CONSTANTS.legend * (row + 1))
-        shade = tuple(float(value) for value in 0.4 + 0.6 * color)
-        cv2.putText(view, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.7, shade, 2, cv2.LINE_AA)
-    return to_png(view, "rgb")
+        shade = tuple(float(value) for value in 255 * (0.4 + 0.6 * color))
+        cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.7, shade, 2, cv2.LINE_AA)
+    return to_png((picture / 255).astype(np.float32), "rgb")
 
 
 def _within(model: GaussianModel, T_base_world: Array) -> NDArray[np.int64]:

@@ -15,7 +15,6 @@ from splatbot.geometry import transform_points
 from splatbot.protocols import Array
 from splatbot.rasterize.views import CONSTANTS as VIEWS
 from splatbot.rasterize.views import render_rgbd
-from splatbot.robots.appearance import Part
 
 
 @dataclass(frozen=True)
@@ -35,8 +34,18 @@ class RobotDrawingConstants:
 
 CONSTANTS = RobotDrawingConstants()
 
+Color = tuple[float, float, float]
 BACKGROUND = (0.09, 0.1, 0.12)
 _LIGHT = np.array([0.3, 0.55, 0.78])  # unit direction against the optical axis, in the camera frame (-x, -y, -z)
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """Triangles (T, 3, 3) [m, link frame] that move with a link, and their colour (3,) in 0..1."""
+
+    link: int
+    triangles: Array
+    color: Color
 
 
 def map_view(
@@ -63,12 +72,12 @@ def draw_robot(
 
     Args:
         view: (H, W, 3) colours in 0..1, changed.
-        depth: (H, W) depth of what the view shows [m], 0 where nothing is; changed if the robot is opaque.
+        depth: (H, W) depth of the surfaces in the view [m], 0 without one; changed if the robot is opaque.
         camera: pinhole camera of the view.
         T_world_camera: (4, 4) its pose.
         parts: triangles in the frames of the links.
         T_world_links: (L, 4, 4) poses of the links [m].
-        tint: (3,) colour that is mixed in, for postures that are told apart. If None, the robot has its own colours.
+        tint: (3,) colour that is mixed in, to distinguish postures. If None, the robot has its own colours.
         opacity: 0..1, small for postures in passing.
     """
     triangles = [transform_points(T_world_links[part.link], part.triangles) for part in parts]

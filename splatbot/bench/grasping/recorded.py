@@ -12,7 +12,8 @@ from splatbot.bench.benchmark import ReportProgress, ignore_progress
 from splatbot.bench.grasping import GraspingSettings
 from splatbot.bench.machine import describe_machine
 from splatbot.bench.results import Results
-from splatbot.cli.grasp import graspable_objects
+from splatbot.errors import InputError
+from splatbot.gaussians import GaussianModel, Snapshot
 from splatbot.grasping.affordance import Target
 from splatbot.grasping.hands import Hands
 from splatbot.grasping.measured import CONSTANTS, RawDepth, contact_distances, hand_penetration
@@ -21,9 +22,11 @@ from splatbot.grasping.types import Grasp
 from splatbot.protocols import Array, HandShape
 from splatbot.results.folder import RunFolder
 from splatbot.results.views import raw_views
+from splatbot.robots.graspable_objects import measured_map, segment_objects
 from splatbot.robots.hands import panda_2f85, panda_2f140
 from splatbot.robots.in_view import reopen_log
 from splatbot.robots.panda import panda
+from splatbot.workspace import find_workspace
 
 HANDS = {"panda": panda, "panda-2f85": panda_2f85, "panda-2f140": panda_2f140}
 _FRAMES = 120  # whose depth checks the grasps; the sampler uses at most 40
@@ -45,7 +48,12 @@ def run_recorded(settings: GraspingSettings, report_progress: ReportProgress = i
 
 
 def _measure(results: Results, case: str, path: Path, name: str, raw: RawDepth, settings: GraspingSettings) -> None:
-    objects = graspable_objects(path, None)
+    place = find_workspace(path)
+    if place is None or place.T_world_base is None:
+        hint = f"write a scene.yaml: splatbot info {path} --fit-plane"
+        raise InputError("is not known.", file=path, field="T_world_base", hint=hint)
+    state = measured_map(Snapshot(GaussianModel.load(path / "map.ply"), map_version=0), RunFolder(path))
+    objects = segment_objects(state, place.T_world_base, place, as_known=True)
     robot = HANDS[name]()
     sampler = objects.sampler(robot, min_observations=_MIN_OBSERVATIONS)
     hand = sampler.hand

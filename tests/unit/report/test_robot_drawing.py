@@ -8,8 +8,8 @@ import pytest
 from splatbot.camera import Camera
 from splatbot.geometry import look_at, transform_points
 from splatbot.protocols import Array
-from splatbot.report.robot_drawing import CONSTANTS, draw_robot
-from splatbot.robots.appearance import Part, appearance
+from splatbot.report.robot_drawing import CONSTANTS, Part, draw_robot
+from splatbot.robots.appearance import appearance
 from splatbot.robots.hands import panda_2f85, panda_2f140
 from splatbot.robots.panda import panda
 from splatbot.robots.robot import RobotModel
@@ -32,7 +32,7 @@ def ball(radius: float = RADIUS) -> list[Part]:
 
 
 def ball_depth() -> Array:
-    """Return the exact depth (H, W) of the ball, inf beside it: the smaller root of |o + z d|² = r²."""
+    """Return the exact depth (H, W) of the ball, inf outside: the smaller root of |o + z d|² = r²."""
     u, v = np.meshgrid(np.arange(160), np.arange(120))
     local = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(u.shape)], axis=-1)
     d, o = local @ T_CAMERA[:3, :3].T, T_CAMERA[:3, 3]
