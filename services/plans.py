@@ -35,6 +35,7 @@ class Plan:
         T_world_base: (4, 4) base of the robot [m].
         result: of the search; it has a path.
         trajectory: the path with its time.
+        margin_source: where its margin comes from.
     """
 
     id: str
@@ -44,6 +45,7 @@ class Plan:
     T_world_base: NDArray[np.float64]
     result: PlanResult
     trajectory: JointTrajectory
+    margin_source: str
 
     @property
     def motion(self) -> MotionRequest:
@@ -66,9 +68,12 @@ class Plans:
         T_world_base: NDArray[np.float64],
         result: PlanResult,
         trajectory: JointTrajectory,
+        margin_source: str,
     ) -> Plan:
         """Keep a plan."""
-        plan = Plan(uuid4().hex[:16], served.id, served.generation, robot, T_world_base, result, trajectory)
+        plan = Plan(
+            uuid4().hex[:16], served.id, served.generation, robot, T_world_base, result, trajectory, margin_source
+        )
         with self._lock:
             self._plans[plan.id] = plan
             if len(self._plans) > _KEPT:

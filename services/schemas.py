@@ -18,6 +18,9 @@ Vector4 = tuple[float, float, float, float]
 Mode = Literal["rgb", "depth", "normal", "alpha"]
 
 
+MOST_MARGIN_M = 10.0  # larger than any arm
+
+
 class Request(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
@@ -158,7 +161,7 @@ class CollisionsRequest(Request):
     q: Configurations = Field(description="(C, J) joint values [rad or m]")
     robot: str = Field("panda", description="as `splatbot robot list` names it")
     base: Pose | None = Field(None, description="T_world_base; by default that of the map")
-    margin: Annotated[float, Field(ge=0, allow_inf_nan=False)] = Field(0.0, description="room to keep [m]")
+    margin: Annotated[float, Field(ge=0, le=MOST_MARGIN_M)] = Field(0.0, description="room to keep [m]")
     opening: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = Field(None, description="of the gripper [m]")
     gradient: bool = Field(False, description="also the clearance's gradient over the joints")
 
@@ -172,7 +175,7 @@ class IkRequest(Request):
     seeds: Annotated[int, Field(ge=1, le=256)] = 32
     map: str | None = Field(None, description="keep only solutions that are free in this map")
     base: Pose | None = Field(None, description="T_world_base; by default that of the map")
-    margin: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
+    margin: Annotated[float, Field(ge=0, le=MOST_MARGIN_M)] = 0.0
 
 
 class PlanRequest(Request):
@@ -185,7 +188,14 @@ class PlanRequest(Request):
     goal_pose: Pose | None = Field(None, description="T_base_tcp")
     robot: str = "panda"
     base: Pose | None = Field(None, description="T_world_base; by default that of the map")
-    margin: Annotated[float, Field(ge=0, allow_inf_nan=False)] = Field(0.0, description="room to keep to the map [m]")
+    margin: Annotated[float, Field(ge=0, le=MOST_MARGIN_M, strict=True)] | Literal["auto"] | None = Field(
+        None,
+        description='clearance to the map [m], or "auto": the audited error of the map where the arm moves; by default '
+        '"auto" where the map has a recording, else 0',
+    )
+    confidence: Annotated[float, Field(ge=0, le=1)] = Field(
+        0.999, description='share of the confirmed surface that the margin "auto" covers'
+    )
     budget_ms: Annotated[float, Field(gt=0, allow_inf_nan=False)] = Field(100.0, description="time to plan")
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
     speed: Annotated[float, Field(gt=0, le=1)] = Field(

@@ -12,11 +12,13 @@ from numpy.typing import NDArray
 from splatbot.collision import RobotSpheres
 from splatbot.errors import InputError, MapNotFoundError, SplatbotError
 from splatbot.geometry import inverse
-from splatbot.planning import GaussianRRTStar, JointGoal, PlanStatus, PoseGoal, time_path
+from splatbot.planning import GaussianRRTStar, JointGoal, PlanStatus, PoseGoal
 from splatbot.planning.ik import solve_ik
 from splatbot.planning.timing import DEFAULT_SPEED
+from splatbot.results.margin import CONSTANTS as MARGIN
 from splatbot.robots.robot import RobotModel
 from splatbot.services.arms import known_robot
+from splatbot.services.margins import margin_source, plan_with_margin
 from splatbot.services.ros.graph import RosGraph, Service
 from splatbot.services.ros.messages import MAP_FRAME
 from splatbot.services.ros.requests import entries, entry, has_content, joints, number, pose, vector
@@ -81,14 +83,22 @@ class MoveItServices:
             start = joints(request, "start_state.joint_state", robot)
             goal = self._goal(request, robot, base)
             budget = min(1e3 * number(request, "allowed_planning_time") or _BUDGET_MS, _LONGEST_MS)
-            planner = GaussianRRTStar(served.field, robot, T_world_base=base)
-            path = planner.plan(start, goal, budget_ms=budget).unwrap()
             # 0 means "not set" in MoveIt, whose own default is 0.1
             speed = number(request, "max_velocity_scaling_factor") or DEFAULT_SPEED
             acceleration = number(request, "max_acceleration_scaling_factor") or DEFAULT_SPEED
-            trajectory = time_path(
-                path, planner.arm, served.field, velocity_scale=speed, acceleration_scale=acceleration
+            found = plan_with_margin(
+                margin_source(served, None),
+                lambda margin: GaussianRRTStar(served.field, robot, T_world_base=base, margin=margin),
+                lambda planner: planner.plan(start, goal, budget_ms=budget),
+                start,
+                goal,
+                confidence=MARGIN.confidence,
+                speed=speed,
+                acceleration=acceleration,
             )
+            found.result.unwrap()
+            trajectory = found.trajectory
+            assert trajectory is not None
             self._store.tell(served, PLAN, trajectory)
             return {
                 "trajectory_start": {"joint_state": {"name": list(robot.chain.names), "position": start}},

@@ -8,11 +8,12 @@ import numpy as np
 from fastapi import APIRouter, Depends, Path, Request, Response
 
 from splatbot.geometry import inverse
-from splatbot.planning import GaussianRRTStar, JointGoal, PoseGoal, time_path
+from splatbot.planning import GaussianRRTStar, JointGoal, PoseGoal
 from splatbot.planning.ik import solve_ik
 from splatbot.services.arms import known_robot
 from splatbot.services.codecs import answer, answers, body_of, request_body
 from splatbot.services.dependencies import ServedAfterFrames, Service, problems
+from splatbot.services.margins import margin_source, plan_with_margin
 from splatbot.services.plans import Plan
 from splatbot.services.problems import TooLargeError
 from splatbot.services.robots_in_maps import arm_in, base_in, joints_of
@@ -37,7 +38,8 @@ _ANSWER = {
     "duration_s": 1.9,
     "certified": True,
     "clearance_m": 0.05,
-    "margin_m": 0.0,
+    "margin_m": 0.006,
+    "margin_source": "audited error of the map in the region of the motion",
     "waypoints": [[0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785], [0.3, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785]],
     "trajectory": {"joint_names": ["panda_joint1"], "points": []},
 }
@@ -70,11 +72,19 @@ def plan(request: Request, served: ServedAfterFrames, service: Service, query: _
         if query.goal_pose is not None
         else JointGoal(joints_of(robot, query.goal or [], "goal"))
     )
-    planner = GaussianRRTStar(served.field, robot, T_world_base=base, margin=query.margin)
-    result = planner.plan(start, goal, budget_ms=query.budget_ms, seed=query.seed)
-    trajectory = time_path(
-        result.unwrap(), planner.arm, served.field, velocity_scale=query.speed, acceleration_scale=query.speed
+    source = margin_source(served, query.margin)
+    found = plan_with_margin(
+        source,
+        lambda margin: GaussianRRTStar(served.field, robot, T_world_base=base, margin=margin),
+        lambda planner: planner.plan(start, goal, budget_ms=query.budget_ms, seed=query.seed),
+        start,
+        goal,
+        confidence=query.confidence,
+        speed=query.speed,
     )
+    result, trajectory = found.result, found.trajectory
+    result.unwrap()
+    assert trajectory is not None
     points = len(trajectory.control) - 2 if query.rate is None else trajectory.duration * query.rate
     most = service.settings.max_configurations
     if points > most:
@@ -84,7 +94,7 @@ def plan(request: Request, served: ServedAfterFrames, service: Service, query: _
             field="rate",
             hint=hint,
         )
-    kept = service.plans.add(served, robot.name, base, result, trajectory)
+    kept = service.plans.add(served, robot.name, base, result, trajectory, source.why)
     service.store.tell(served, PLAN, trajectory)
     return answer(request, _description(kept, query.rate))
 
@@ -140,6 +150,7 @@ def _description(plan: Plan, rate: float | None) -> dict[str, Any]:
         "certified": certificate.certified,
         "clearance_m": certificate.clearance,
         "margin_m": certificate.margin,
+        "margin_source": plan.margin_source,
         "waypoints": np.asarray(path.waypoints),
         "trajectory": trajectory.to_ros(rate=rate),
     }

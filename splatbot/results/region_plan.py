@@ -58,6 +58,7 @@ def plan_in_region(
     *,
     confidence: float,
     speed: float = 1.0,
+    acceleration: float | None = None,
 ) -> RegionPlan:
     """Plan with the audited error of the region of the motion as the margin.
 
@@ -74,7 +75,8 @@ def plan_in_region(
         ends: (E, J) known configurations of the motion, as start and goal [rad or m].
         error: audited error of the map.
         confidence: share of the confirmed surface points that the margin covers, 0..1.
-        speed: fraction of the limits of velocity and acceleration, 0..1.
+        speed: fraction of the limits of velocity, 0..1.
+        acceleration: fraction of the limits of acceleration, 0..1; by default ``speed``.
 
     Raises:
         InputError: the margins still increase after five plans, or the confidence is not in 0..1.
@@ -87,7 +89,10 @@ def plan_in_region(
         result = plan(planner)
         if result.path is None:
             return RegionPlan(planner, result, None, 0, margin)
-        trajectory = time_path(result.path, planner.arm, planner.field, velocity_scale=speed, acceleration_scale=speed)
+        scales = (speed, speed if acceleration is None else acceleration)
+        trajectory = time_path(
+            result.path, planner.arm, planner.field, velocity_scale=scales[0], acceleration_scale=scales[1]
+        )
         moments = np.linspace(0.0, trajectory.duration, CONSTANTS.samples)
         region = _around(planner.arm, trajectory.at(moments).position, error, confidence)
         required = region.quantile(confidence)

@@ -114,6 +114,15 @@ def test_spheres_of_no_size_and_of_ten_metres(radius: float) -> None:
     assert not hit[truth > 2e-4].any()
 
 
+@pytest.mark.parametrize("margin", [1e3, 1e18, 1e20, 1e38, 1e300])
+@pytest.mark.parametrize("count", [1, 3, 2500])
+def test_a_margin_of_any_finite_size_is_in_collision(margin: float, count: int) -> None:
+    field = GaussianCollisionField(random_gaussians(count, np.random.default_rng(15), least=5e-3))
+    arm = RobotSpheres(panda(), T_world_base=np.diag([1.0, 1.0, 1.0, 1.0]) + 30 * np.eye(4, k=3), margin=margin)
+    assert arm.check(field, panda().home).in_collision.all()  # 1e20² is infinite in float32
+    assert (arm.clearance(field, panda().home).distance < 0.0).all()
+
+
 def test_quaternions_of_any_norm_are_directions() -> None:
     rng = np.random.default_rng(7)
     model = random_gaussians(100, rng)

@@ -90,7 +90,9 @@ SB_INLINE bool tree_hit(const SolidsView& s, const Split& p, float r) {
   if (s.top == nullptr) {
     return false;
   }
-  const float reach = (r + p.slack) * (1.0F + 1e-5F) + 1e-12F;
+  // With an infinite square, empty places of the tree, which are infinitely far, would be visited.
+  const float far = (r + p.slack) * (1.0F + 1e-5F) + 1e-12F;
+  const float reach = far < 1e18F ? far : 1e18F;
   const F reach2 = set1(reach * reach);
   SolidLeaf room;
   Place stack[kStack];

@@ -1,0 +1,103 @@
+"""Margins of plans over HTTP and MoveIt: audited where the map has a recording, stated where nothing is known."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from splatbot.cli import main
+from splatbot.gaussians import GaussianModel, Snapshot
+from splatbot.results.folder import RunFolder
+from splatbot.results.margin import audited_error
+from splatbot.robots.in_view import reopen_log
+from splatbot.robots.panda import panda
+from splatbot.services.settings import ServiceSettings
+from splatbot.services.store import MapStore
+from tests.contracts.conftest import Service, running, wall
+
+HOME = panda().home.tolist()
+GOAL = [0.3, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785]
+BASE = {"translation": [0.0, 0.9, 0.3], "quat_wxyz": [1.0, 0.0, 0.0, 0.0]}
+FAR = {"translation": [0.0, 30.0, 0.0], "quat_wxyz": [1.0, 0.0, 0.0, 0.0]}
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of four frames."""
+    run = tmp_path_factory.mktemp("runs") / "table"
+    assert main(["map", "synthetic:tabletop?frames=4&width=160&height=120", "--out", str(run), "--quiet"]) == 0
+    return run
+
+
+@pytest.fixture(scope="module")
+def service(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
+    """A service with the map of a recording, one without, and one whose recording is lost."""
+    lost = tmp_path_factory.mktemp("lost") / "table"
+    shutil.copytree(recorded, lost)
+    store = MapStore()
+    state = Snapshot(GaussianModel.load(recorded / "map.ply"), 1)
+    store.add("table", source="table", state="static", snapshot=state, run=RunFolder(recorded))
+    store.add("lost", source="lost", state="static", snapshot=state, run=RunFolder(lost))
+    store.add("wall", source="wall.ply", state="static", snapshot=wall())
+    for file in lost.glob("*.json*"):
+        file.unlink()
+    with running(ServiceSettings(), store) as one:
+        yield one
+
+
+def plan(service: Service, name: str, **request: Any) -> Any:
+    body = {"start": HOME, "goal": GOAL, "base": FAR, "budget_ms": 50} | request
+    return service.client.post(f"/v1/maps/{name}/plans", json=body)
+
+
+def test_the_default_margin_of_a_recorded_map_is_its_audited_error(service: Service, recorded: Path) -> None:
+    answer = plan(service, "table").json()
+    assert answer["margin_source"] == "audited error of the map in the region of the motion"
+    error = audited_error(recorded, reopen_log(RunFolder(recorded)), service.store.get("table").field)
+    assert answer["margin_m"] == pytest.approx(error.quantile(0.999))  # far from all points, so that all count
+    assert answer["margin_m"] > 0.0
+    assert answer["certified"]
+    median = plan(service, "table", margin="auto", confidence=0.5).json()["margin_m"]
+    assert median == pytest.approx(error.quantile(0.5))
+
+
+def test_a_given_margin_is_kept_and_stated(service: Service) -> None:
+    answer = plan(service, "table", margin=0.012).json()
+    assert answer["margin_m"] == 0.012
+    assert answer["margin_source"] == "given"
+    zero = plan(service, "table", margin=0).json()
+    assert (zero["margin_m"], zero["margin_source"]) == (0.0, "given")
+
+
+def test_without_a_recording_the_answer_says_that_the_error_is_unknown(service: Service) -> None:
+    answer = plan(service, "wall").json()
+    assert answer["margin_m"] == 0.0
+    assert answer["margin_source"] == "unknown: the map has no recording; 0 is assumed"
+    asked = plan(service, "wall", margin="auto")
+    assert asked.status_code == 422
+    assert "which has no recording" in asked.json()["detail"]
+
+
+def test_a_recording_that_cannot_be_read_is_stated_and_refused_where_it_was_asked_for(service: Service) -> None:
+    answer = plan(service, "lost").json()
+    assert answer["margin_m"] == 0.0
+    assert answer["margin_source"].startswith("unknown: the recording cannot be audited (")
+    asked = plan(service, "lost", margin="auto")
+    assert 400 <= asked.status_code < 500
+
+
+@pytest.mark.parametrize("margin", [-0.1, "much", "1e400", float("1e300"), True])
+def test_margins_that_make_no_sense_are_refused(service: Service, margin: Any) -> None:
+    assert plan(service, "table", margin=margin).status_code == 422
+
+
+def test_a_plan_that_is_asked_again_states_the_same_margin(service: Service) -> None:
+    answer = plan(service, "table").json()
+    again = service.client.get(f"/v1/plans/{answer['id']}").json()
+    assert (again["margin_m"], again["margin_source"]) == (answer["margin_m"], answer["margin_source"])
+    assert np.isfinite(again["margin_m"])
