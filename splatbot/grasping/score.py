@@ -26,7 +26,7 @@ WEIGHTS: Mapping[str, float] = {
     "clear": 4.0,  # whether hand and arm avoid regions where motion was observed; absent without such regions
     "clearance": 2.0,  # clearance of the hand along the approach
     "seen": 2.0,  # observed fraction of the surface at the contacts
-    "measured": 4.0,  # fraction of the contacts at confirmed points of raw depth; absent without raw depth
+    "measured": 1.0,  # fraction of the contacts at confirmed points of raw depth; absent without raw depth
     "certain": 1.0,  # standard deviation of the surface at the contacts
     "upright": 0.5,  # cosine between the approach direction and down
     "near": 2.0,  # distance of the contacts from the indicated point; absent without one
@@ -59,8 +59,8 @@ class ScoreConstants:
     zero_score_std: float = 0.004
     density: float = 1000.0
     load_acceleration: float = 2 * 9.81
-    confidence_slope: float = 9.4
-    confidence_offset: float = -2.6
+    confidence_slope: float = 10.1
+    confidence_offset: float = -3.1
     similar_distance: float = 0.008
     similar_angle: float = 0.26
 

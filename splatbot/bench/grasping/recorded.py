@@ -31,6 +31,7 @@ from splatbot.workspace import find_workspace
 HANDS = {"panda": panda, "panda-2f85": panda_2f85, "panda-2f140": panda_2f140}
 _FRAMES = 120  # whose depth checks the grasps; the sampler uses at most 40
 _MIN_OBSERVATIONS = 3
+_DEEP_M = 0.003  # of a confirmed point in a hand; the search accepts less, because it samples fewer points
 
 
 def run_recorded(settings: GraspingSettings, report_progress: ReportProgress = ignore_progress) -> Results:
@@ -71,7 +72,7 @@ def _measure(results: Results, case: str, path: Path, name: str, raw: RawDepth, 
         for grasp in result.grasps:
             deep = _deepest(grasp, measured, hand)
             deepest.append(deep)
-            counts["hands deeper than 3 mm in confirmed depth"] += deep > CONSTANTS.max_penetration
+            counts["hands deeper than 3 mm in confirmed depth"] += deep > _DEEP_M
             away = contact_distances(grasp.contacts, measured)
             said = ~np.array(grasp.implied)
             counts["contacts"] += 2
