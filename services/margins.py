@@ -40,7 +40,7 @@ def margin_source(served: ServedMap, given: Margin) -> MarginSource:
     """Return the source of a margin. The audit of a map version takes seconds, once.
 
     Raises:
-        SplatbotError: the margin is "auto" and the map's recording cannot be read, or there is none.
+        SplatbotError: the margin is "auto" and the map has no recording, or one that cannot be read.
     """
     if isinstance(given, float):
         return MarginSource(None, given, "given")

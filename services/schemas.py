@@ -190,8 +190,8 @@ class PlanRequest(Request):
     base: Pose | None = Field(None, description="T_world_base; by default that of the map")
     margin: Annotated[float, Field(ge=0, le=MOST_MARGIN_M, strict=True)] | Literal["auto"] | None = Field(
         None,
-        description='clearance to the map [m], or "auto": the audited error of the map where the arm moves; by default '
-        '"auto" where the map has a recording, else 0',
+        description='clearance to the map [m], or "auto": the audited error of the map where the arm moves. The '
+        'default is "auto" where the map has a recording, else 0',
     )
     confidence: Annotated[float, Field(ge=0, le=1)] = Field(
         0.999, description='share of the confirmed surface that the margin "auto" covers'

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from splatbot.collision.confirmed import confirmed_near
 from splatbot.collision.visibility import DepthView
+from splatbot.geometry import transform_points
 from splatbot.grasping.hands import Hands
 from splatbot.protocols import Array, HandShape
 
@@ -23,6 +24,7 @@ class MeasuredDepthConstants:
         max_penetration: [m] accepted depth of a confirmed point in fingers or palm.
         contact_distance: [m] largest distance of a measured contact from the nearest confirmed point.
         spacing: [m] edge of the voxels in which each frame proposes one point.
+        fine_spacing: [m] the same for the last check of one grasp.
         max_points: largest number of points that are confirmed; it bounds the work.
         hands_per_chunk: hands that are evaluated at once; it bounds memory.
     """
@@ -30,7 +32,8 @@ class MeasuredDepthConstants:
     max_penetration: float = 0.002
     contact_distance: float = 0.003
     spacing: float = 0.003
-    max_points: int = 200_000
+    fine_spacing: float = 0.001
+    max_points: int = 60_000
     hands_per_chunk: int = 16
 
 
@@ -67,6 +70,22 @@ class RawDepth:
             floor=self.floor,
             quad=self.quad,
             spacing=CONSTANTS.spacing,
+            most=CONSTANTS.max_points,
+        )
+
+    def at_fingers(self, hands: Hands, hand: HandShape) -> Array:
+        """Return the confirmed surface points (S, 3) [m, world] in a box around the fingers of one hand, densely."""
+        x, y = hand.width / 2, hands.opening[0] / 2 + hand.thickness
+        signs = [(sx, sy) for sx in (-1, 1) for sy in (-1, 1)]
+        corners = np.array([[sx * x, sy * y, z] for sx, sy in signs for z in (-hand.palm, hand.tip)])
+        at = transform_points(hands.T[0], corners)
+        return confirmed_near(
+            self.views,
+            at.min(axis=0),
+            at.max(axis=0),
+            floor=self.floor,
+            quad=self.quad,
+            spacing=CONSTANTS.fine_spacing,
             most=CONSTANTS.max_points,
         )
 

@@ -18,7 +18,7 @@ from splatbot.grasping.antipodal import Pairs, PairSearch, antipodal_pairs
 from splatbot.grasping.hands import CONSTANTS as HANDS
 from splatbot.grasping.hands import Hands, measure_hands, palm_free, place_hands
 from splatbot.grasping.measured import CONSTANTS as MEASURED
-from splatbot.grasping.measured import closed_width, contact_distances, hand_penetration
+from splatbot.grasping.measured import RawDepth, closed_width, contact_distances, hand_penetration
 from splatbot.grasping.obstacles import around_target
 from splatbot.grasping.options import GraspOptions
 from splatbot.grasping.reach import ReachabilityCheck
@@ -331,7 +331,10 @@ class Search:
         for grasp in grasps:
             if wanted == 0:
                 break
-            checked.append((grasp, "") if reach is None else self._with_arm(grasp, reach))
+            judged, kind = (grasp, "") if reach is None else self._with_arm(grasp, reach)
+            if not judged.rejected and self.s.raw is not None:
+                judged, kind = self._at_full_density(judged, self.s.raw)
+            checked.append((judged, kind))
             wanted -= not checked[-1][0].rejected
         return checked
 
@@ -344,6 +347,19 @@ class Search:
         q = reached.q
         found = replace(grasp, terms=terms, total=total, q=q, q_pregrasp=reached.path[0], approach_path=reached.path)
         return found, ""
+
+    def _at_full_density(self, grasp: Grasp, raw: RawDepth) -> tuple[Grasp, str]:
+        """Check the fingers with all confirmed points around them; the kind of rejection is empty if they are free."""
+        zero = np.zeros(1)
+        hands = Hands(grasp.T_world_tcp[None], np.zeros(1, np.int64), np.array([grasp.opening]), *[zero] * 4)
+        points = raw.at_fingers(hands, self.s.hand)
+        deep = float(hand_penetration(hands, points, self.s.hand, retreat=0.0)[0])
+        if deep > MEASURED.max_penetration:
+            return replace(grasp, rejected=f"is {1e3 * deep:.1f} mm deep in measured depth"), "are in measured depth"
+        width = max(grasp.width, float(closed_width(hands, points, self.s.hand)[0]))
+        assert grasp.depth_distance is not None
+        away = np.minimum(grasp.depth_distance, contact_distances(grasp.contacts, points))
+        return replace(grasp, width=width, depth_distance=away), ""
 
     def _scored(self, hands: Hands, clearance: Array) -> _Scored:
         terms = hand_terms(

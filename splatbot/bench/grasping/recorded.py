@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -64,12 +63,13 @@ def _measure(results: Results, case: str, path: Path, name: str, raw: RawDepth, 
     for one in objects.scene.objects[: 3 if settings.quick else None]:
         target = Target(one.rows, None, f"object {one.number}", "bench", 1.0, (), one.number)
         result = sampler.sample(target, GraspOptions(samples=100 if settings.quick else GraspOptions().samples))
-        measured = raw.around(points[one.rows], hand)
+        around = raw.around(points[one.rows], hand)
         seconds.append(sum(result.seconds.values()))
         counts["objects with a grasp"] += bool(result.grasps)
         counts["objects with grasps on implied sides alone"] += bool(result.doubtful) and not result.grasps
         counts["grasps"] += len(result.grasps)
         for grasp in result.grasps:
+            measured = np.concatenate([around, raw.at_fingers(_hands(grasp, grasp.opening), hand)])
             deep = _deepest(grasp, measured, hand)
             deepest.append(deep)
             counts["hands deeper than 3 mm in confirmed depth"] += deep > _DEEP_M
@@ -97,11 +97,14 @@ def _measure(results: Results, case: str, path: Path, name: str, raw: RawDepth, 
 
 def _deepest(grasp: Grasp, measured: Array, hand: HandShape) -> float:
     """Return the depth of the deepest confirmed point in the hand, on its approach and closed [m]."""
-    zero = np.zeros(1)
-    open_ = Hands(grasp.T_world_tcp[None], np.zeros(1, np.int64), np.array([grasp.opening]), zero, zero, zero, zero)
-    closed = replace(open_, opening=np.array([grasp.width]))
     retreat = float(np.linalg.norm(grasp.T_world_tcp[:3, 3] - grasp.T_world_pregrasp[:3, 3]))
     return max(
-        float(hand_penetration(open_, measured, hand, retreat=retreat)[0]),
-        float(hand_penetration(closed, measured, hand, retreat=0.0)[0]),
+        float(hand_penetration(_hands(grasp, grasp.opening), measured, hand, retreat=retreat)[0]),
+        float(hand_penetration(_hands(grasp, grasp.width), measured, hand, retreat=0.0)[0]),
     )
+
+
+def _hands(grasp: Grasp, opening: float) -> Hands:
+    """Return the hand of a grasp with another opening [m]."""
+    zero = np.zeros(1)
+    return Hands(grasp.T_world_tcp[None], np.zeros(1, np.int64), np.array([opening]), *[zero] * 4)
