@@ -18,7 +18,7 @@ from splatbot.atomic import atomic_write
 from splatbot.errors import FormatError
 from splatbot.geometry import transform_points
 from splatbot.protocols import Array
-from splatbot.report.robot_drawing import Color, Part
+from splatbot.report.robot_drawing import Color, DrawnPart
 from splatbot.robots.maker_meshes import SOURCES, Source
 from splatbot.robots.panda import T_LINK_HAND
 from splatbot.robots.robot import RobotModel
@@ -30,7 +30,7 @@ _LIGHT, _DARK = (0.90, 0.90, 0.91), (0.30, 0.31, 0.33)
 _GREY = (200, 200, 200)  # of a mesh without a material
 
 
-def appearance(robot: RobotModel, opening: float | None = None) -> list[Part]:
+def appearance(robot: RobotModel, opening: float | None = None) -> list[DrawnPart]:
     """Return the parts of a robot with ``opening`` [m] between its fingers; None opens them fully.
 
     Raises:
@@ -46,7 +46,7 @@ def appearance(robot: RobotModel, opening: float | None = None) -> list[Part]:
         fingers = ((piece.triangles, piece.color) for piece in meshes["finger"])
         return parts + [part for triangles, color in fingers for part in _fingers(robot, triangles, color, opening)]
     drawn = {part.link for part in parts} - {last}  # a hand on the last link is not the Panda's own
-    shapes = [Part(shape.link, shape.triangles(), _DARK) for shape in robot.shapes if shape.link not in drawn]
+    shapes = [DrawnPart(shape.link, shape.triangles(), _DARK) for shape in robot.shapes if shape.link not in drawn]
     if robot.gripper is not None and robot.gripper.shapes:
         own = np.concatenate([shape.triangles() for shape in robot.gripper.shapes])
         shapes += _fingers(robot, own, _DARK, opening)
@@ -54,17 +54,17 @@ def appearance(robot: RobotModel, opening: float | None = None) -> list[Part]:
         return parts + shapes
     spheres = robot.spheres(opening)
     return [
-        Part(int(link), np.asarray(center + radius * _ball()), _LIGHT)
+        DrawnPart(int(link), np.asarray(center + radius * _ball()), _LIGHT)
         for link, center, radius in zip(spheres.link, spheres.centers, spheres.radii, strict=True)
     ]
 
 
-def _fingers(robot: RobotModel, triangles: Array, color: Color, opening: float | None) -> list[Part]:
+def _fingers(robot: RobotModel, triangles: Array, color: Color, opening: float | None) -> list[DrawnPart]:
     """Return both fingers in the frame of the last link, from the triangles of one in its own frame."""
     assert robot.gripper is not None
     aside = robot.gripper.stroke if opening is None else opening / 2
     moved = triangles + np.array([0.0, aside, 0.0])
-    return [Part(len(robot), transform_points(T, moved), color) for T in robot.gripper.T_link_finger]
+    return [DrawnPart(len(robot), transform_points(T, moved), color) for T in robot.gripper.T_link_finger]
 
 
 @cache
@@ -77,16 +77,16 @@ def _ball() -> Array:
 
 
 @cache
-def _panda_meshes() -> dict[str, list[Part]]:
+def _panda_meshes() -> dict[str, list[DrawnPart]]:
     """Return the pieces of each part of the Panda in its own frame; their link is 0."""
-    found: dict[str, list[Part]] = {}
+    found: dict[str, list[DrawnPart]] = {}
     try:
         with np.load(_FILE) as stored:
             for name in stored.files:
                 if name.count("/") == 1:
                     triangles = _STEP * stored[name].astype(np.float64)[stored[f"{name}/faces"]]
                     red, green, blue = (float(value) / 255 for value in stored[f"{name}/color"])
-                    found.setdefault(name.split("/")[0], []).append(Part(0, triangles, (red, green, blue)))
+                    found.setdefault(name.split("/")[0], []).append(DrawnPart(0, triangles, (red, green, blue)))
     except (OSError, ValueError, KeyError) as error:
         raise FormatError(f"holds no meshes ({error}).", file=_FILE, hint="install splatbot again") from error
     return found

@@ -16,7 +16,7 @@ from splatbot.geometry import inverse, look_at, transform_points
 from splatbot.grasping.types import Grasp
 from splatbot.protocols import Array
 from splatbot.rasterize.views import to_png
-from splatbot.report.robot_drawing import Part, draw_robot, map_view
+from splatbot.report.robot_drawing import DrawnPart, draw_robot, map_view
 from splatbot.report.sphere_gaussians import sphere_gaussians
 from splatbot.segmentation import SegmentedMap
 
@@ -46,7 +46,7 @@ def grasp_png(
     scene: SegmentedMap,
     rows: NDArray[np.int64],
     grasp: Grasp,
-    hand: Sequence[Part],
+    hand: Sequence[DrawnPart],
     T_link_tcp: Array,
     *,
     width: int = 1280,

@@ -18,7 +18,7 @@ from splatbot.planning import JointTrajectory
 from splatbot.protocols import Array
 from splatbot.rasterize.views import to_png
 from splatbot.report.moving_page import bytes_of, evenly_spaced, moving_page, packed
-from splatbot.report.robot_drawing import Part, draw_robot, map_view
+from splatbot.report.robot_drawing import DrawnPart, draw_robot, map_view
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ def plan_png(
     model: GaussianModel,
     arm: RobotSpheres,
     trajectory: JointTrajectory,
-    parts: Sequence[Part],
+    parts: Sequence[DrawnPart],
     fk: Callable[[Array], Array],
     *,
     width: int = 960,

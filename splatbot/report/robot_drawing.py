@@ -40,7 +40,7 @@ _LIGHT = np.array([0.3, 0.55, 0.78])  # unit direction against the optical axis,
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class DrawnPart:
     """Triangles (T, 3, 3) [m, link frame] that move with a link, and their colour (3,) in 0..1."""
 
     link: int
@@ -62,7 +62,7 @@ def draw_robot(
     depth: NDArray[np.float32],
     camera: Camera,
     T_world_camera: Array,
-    parts: Sequence[Part],
+    parts: Sequence[DrawnPart],
     T_world_links: Array,
     *,
     tint: Sequence[float] | None = None,

@@ -8,7 +8,7 @@ import pytest
 from splatbot.camera import Camera
 from splatbot.geometry import look_at, transform_points
 from splatbot.protocols import Array
-from splatbot.report.robot_drawing import CONSTANTS, Part, draw_robot
+from splatbot.report.robot_drawing import CONSTANTS, DrawnPart, draw_robot
 from splatbot.robots.appearance import appearance
 from splatbot.robots.hands import panda_2f85, panda_2f140
 from splatbot.robots.panda import panda
@@ -20,7 +20,7 @@ T_CAMERA = look_at(np.array([0.0, -1.0, 0.5]), np.zeros(3))
 RADIUS = 0.2
 
 
-def ball(radius: float = RADIUS) -> list[Part]:
+def ball(radius: float = RADIUS) -> list[DrawnPart]:
     """Return a fine ball of 40,000 triangles about the origin of link 0."""
     turn, rise = np.meshgrid(np.linspace(0, 2 * np.pi, 201), np.linspace(0, np.pi, 101))
     grid = radius * np.stack([np.sin(rise) * np.cos(turn), np.sin(rise) * np.sin(turn), np.cos(rise)], axis=-1)
@@ -28,7 +28,7 @@ def ball(radius: float = RADIUS) -> list[Part]:
     triangles = np.concatenate(
         [np.stack([a, b, c], axis=2).reshape(-1, 3, 3), np.stack([a, c, d], axis=2).reshape(-1, 3, 3)]
     )
-    return [Part(0, triangles, (1.0, 1.0, 1.0))]
+    return [DrawnPart(0, triangles, (1.0, 1.0, 1.0))]
 
 
 def ball_depth() -> Array:
