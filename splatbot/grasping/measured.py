@@ -29,7 +29,7 @@ class MeasuredDepthConstants:
         hands_per_chunk: hands that are evaluated at once; it bounds memory.
     """
 
-    max_penetration: float = 0.002
+    max_penetration: float = 0.003
     contact_distance: float = 0.003
     spacing: float = 0.003
     fine_spacing: float = 0.001
@@ -115,7 +115,7 @@ def hand_penetration(hands: Hands, points: Array, hand: HandShape, *, retreat: f
 
 
 def closed_width(hands: Hands, points: Array, hand: HandShape) -> Array:
-    """Return the smallest width (K,) [m] between the fingers at which no point between them is deeper than 2 mm.
+    """Return the smallest width (K,) [m] between the fingers at which no point between them is deeper than 3 mm.
 
     The fingers close until they meet the object. Depth of a point in a finger is defined as in
     :func:`hand_penetration`. The width is 0 if no point is between the fingers.

@@ -30,7 +30,7 @@ from splatbot.workspace import find_workspace
 HANDS = {"panda": panda, "panda-2f85": panda_2f85, "panda-2f140": panda_2f140}
 _FRAMES = 120  # whose depth checks the grasps; the sampler uses at most 40
 _MIN_OBSERVATIONS = 3
-_DEEP_M = 0.003  # of a confirmed point in a hand; the search accepts less, because it samples fewer points
+_DEEP_M = 0.003  # of a confirmed point in a hand
 
 
 def run_recorded(settings: GraspingSettings, report_progress: ReportProgress = ignore_progress) -> Results:
