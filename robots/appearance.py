@@ -2,6 +2,8 @@
 
 The Panda's are Franka's visual meshes (Apache-2.0), simplified. Other robots show the shapes of the twin, and without
 these the spheres of their certified body. Pictures alone use them; no check does.
+
+`python -m splatbot.robots.appearance` makes the stored meshes from those of :mod:`splatbot.robots.maker_meshes`.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ from splatbot.geometry import transform_points
 from splatbot.protocols import Array
 from splatbot.report.robot_drawing import Color, DrawnPart
 from splatbot.robots.maker_meshes import SOURCES, Source
-from splatbot.robots.panda import T_LINK_HAND
+from splatbot.robots.panda import T_LINK_HAND, panda
 from splatbot.robots.robot import RobotModel
 
 _FILE = Path(__file__).parent / "bodies" / "panda_appearance.npz"
@@ -36,9 +38,9 @@ def appearance(robot: RobotModel, opening: float | None = None) -> list[DrawnPar
     Raises:
         FormatError: the stored meshes are damaged.
     """
-    last, meshes = len(robot), _panda_meshes() if robot.name.split("-")[0] == "panda" else {}
+    last, meshes = len(robot), _panda_meshes() if _has_panda_arm(robot) else {}
     parts = [replace(piece, link=k) for k in range(last + 1) for piece in meshes.get(f"link{k}", ())]
-    if robot.name == "panda":
+    if robot is panda():
         parts += [
             replace(piece, link=last, triangles=transform_points(T_LINK_HAND, piece.triangles))
             for piece in meshes["hand"]
@@ -57,6 +59,14 @@ def appearance(robot: RobotModel, opening: float | None = None) -> list[DrawnPar
         DrawnPart(int(link), np.asarray(center + radius * _ball()), _LIGHT)
         for link, center, radius in zip(spheres.link, spheres.centers, spheres.radii, strict=True)
     ]
+
+
+def _has_panda_arm(robot: RobotModel) -> bool:
+    """Return whether the joints are those of the Panda; a name alone could be that of another arm."""
+    own = panda().joints
+    return len(robot) == len(own) and all(
+        np.array_equal(a.T_before_joint, b.T_before_joint) for a, b in zip(robot.joints, own, strict=True)
+    )
 
 
 def _fingers(robot: RobotModel, triangles: Array, color: Color, opening: float | None) -> list[DrawnPart]:

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatbot.errors import InputError, SplatbotError
-from splatbot.planning import GaussianRRTStar, JointGoal, PlanResult, PoseGoal, time_path
+from splatbot.planning import GaussianRRTStar, JointGoal, PlanResult, PoseGoal
 from splatbot.results.margin import AuditedError, audited_error
-from splatbot.results.region_plan import RegionPlan, plan_in_region
+from splatbot.results.region_plan import RegionPlan, plan_at_margin, plan_in_region
 from splatbot.robots.in_view import reopen_log
 from splatbot.services.store import ServedMap
 
@@ -27,7 +27,7 @@ class MarginSource:
 
     Args:
         error: audited error of the map. If None, the margin is a number.
-        margin: that number [m]; the least margin otherwise.
+        margin: that number [m]; not used with an error.
         why: description for the answer.
     """
 
@@ -76,13 +76,7 @@ def plan_with_margin(
         return plan_in_region(
             make_planner, plan, ends, source.error, confidence=confidence, speed=speed, acceleration=acceleration
         )
-    planner = make_planner(source.margin)
-    result = plan(planner)
-    timed = None
-    if result.path is not None:
-        scale = speed if acceleration is None else acceleration
-        timed = time_path(result.path, planner.arm, planner.field, velocity_scale=speed, acceleration_scale=scale)
-    return RegionPlan(planner, result, timed, points=None, error=None)
+    return plan_at_margin(make_planner(source.margin), plan, speed=speed, acceleration=acceleration)
 
 
 def _audit(served: ServedMap) -> AuditedError:

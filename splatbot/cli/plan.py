@@ -160,20 +160,14 @@ def _plan(
     speed: float,
 ) -> RegionPlan:
     """Plan with a given margin, or with the audited margin of the region."""
-    from splatbot.planning import time_path
     from splatbot.results.margin import audited_error
-    from splatbot.results.region_plan import RegionPlan, plan_in_region
+    from splatbot.results.region_plan import plan_at_margin, plan_in_region
     from splatbot.robots.in_view import reopen_log
 
     if margin == "auto":
         error = audited_error(map_, reopen_log(run_folder(map_, "--margin auto")), of_map)
         return plan_in_region(make_planner, plan_once, ends, error, confidence=confidence, speed=speed)
-    planner = make_planner(margin_value(margin))
-    result = plan_once(planner)
-    if result.path is None:
-        return RegionPlan(planner, result, None, points=None, error=None)
-    timed = time_path(result.path, planner.arm, planner.field, velocity_scale=speed, acceleration_scale=speed)
-    return RegionPlan(planner, result, timed, points=None, error=None)
+    return plan_at_margin(make_planner(margin_value(margin)), plan_once, speed=speed)
 
 
 def _joints(words: tuple[str, ...], robot: RobotModel, flag: str) -> NDArray[np.float64]:

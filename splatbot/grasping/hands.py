@@ -69,6 +69,12 @@ class Hands:
     pad_coverage: Array
     closure: Array
 
+    @classmethod
+    def one(cls, T: Array, opening: float) -> Hands:
+        """Return a single hand at a pose (4, 4) that belongs to no pair; nothing of it is measured."""
+        zero = np.zeros(1)
+        return cls(T[None], np.zeros(1, np.int64), np.array([opening]), zero, zero, zero, zero)
+
     def __len__(self) -> int:
         return len(self.T)
 

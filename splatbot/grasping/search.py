@@ -350,8 +350,7 @@ class Search:
 
     def _at_full_density(self, grasp: Grasp, raw: RawDepth) -> tuple[Grasp, str]:
         """Check the fingers with all confirmed points around them; the kind of rejection is empty if they are free."""
-        zero = np.zeros(1)
-        hands = Hands(grasp.T_world_tcp[None], np.zeros(1, np.int64), np.array([grasp.opening]), *[zero] * 4)
+        hands = Hands.one(grasp.T_world_tcp, grasp.opening)
         points = raw.at_fingers(hands, self.s.hand)
         deep = float(hand_penetration(hands, points, self.s.hand, retreat=0.0)[0])
         if deep > MEASURED.max_penetration:
@@ -389,9 +388,7 @@ class Search:
             clearance=float(scored.clearance[k]),
             T_world_pregrasp=along(T, -self.o.pregrasp),
             rejected=rejected,
-            depth_distance=None
-            if self.measured is None
-            else contact_distances(self.pairs.contacts[pair], self.measured),
+            depth_distance=None if self.measured is None else contact_distances(contacts, self.measured),
         )
 
     def _closed_width(self, hands: Hands, k: int) -> float:

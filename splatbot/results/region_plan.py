@@ -9,7 +9,7 @@ import numpy as np
 
 from splatbot.collision import RobotSpheres
 from splatbot.errors import InputError
-from splatbot.planning import GaussianRRTStar, JointTrajectory, PlanResult, time_path
+from splatbot.planning import GaussianRRTStar, JointTrajectory, Path, PlanResult, time_path
 from splatbot.protocols import Array
 from splatbot.results.margin import CONSTANTS as MARGIN
 from splatbot.results.margin import AuditedError
@@ -89,10 +89,7 @@ def plan_in_region(
         result = plan(planner)
         if result.path is None:
             return RegionPlan(planner, result, None, 0, margin)
-        scales = (speed, speed if acceleration is None else acceleration)
-        trajectory = time_path(
-            result.path, planner.arm, planner.field, velocity_scale=scales[0], acceleration_scale=scales[1]
-        )
+        trajectory = _timed(planner, result.path, speed, acceleration)
         moments = np.linspace(0.0, trajectory.duration, CONSTANTS.samples)
         region = _around(planner.arm, trajectory.at(moments).position, error, confidence)
         required = region.quantile(confidence)
@@ -104,6 +101,25 @@ def plan_in_region(
         field="margin",
         hint="give the margin in metres, or a lower confidence",
     )
+
+
+def plan_at_margin(
+    planner: GaussianRRTStar,
+    plan: Callable[[GaussianRRTStar], PlanResult],
+    *,
+    speed: float,
+    acceleration: float | None = None,
+) -> RegionPlan:
+    """Plan with the margin that was given, without an audit; see :func:`plan_in_region` for the arguments."""
+    result = plan(planner)
+    trajectory = None if result.path is None else _timed(planner, result.path, speed, acceleration)
+    return RegionPlan(planner, result, trajectory, points=None, error=None)
+
+
+def _timed(planner: GaussianRRTStar, path: Path, speed: float, acceleration: float | None) -> JointTrajectory:
+    """Time a path with fractions of the limits of velocity and acceleration."""
+    scale = speed if acceleration is None else acceleration
+    return time_path(path, planner.arm, planner.field, velocity_scale=speed, acceleration_scale=scale)
 
 
 def _around(arm: RobotSpheres, q: Array, error: AuditedError, confidence: float) -> AuditedError:

@@ -69,7 +69,7 @@ def _measure(results: Results, case: str, path: Path, name: str, raw: RawDepth, 
         counts["objects with grasps on implied sides alone"] += bool(result.doubtful) and not result.grasps
         counts["grasps"] += len(result.grasps)
         for grasp in result.grasps:
-            measured = np.concatenate([around, raw.at_fingers(_hands(grasp, grasp.opening), hand)])
+            measured = np.concatenate([around, raw.at_fingers(Hands.one(grasp.T_world_tcp, grasp.opening), hand)])
             deep = _deepest(grasp, measured, hand)
             deepest.append(deep)
             counts["hands deeper than 3 mm in confirmed depth"] += deep > _DEEP_M
@@ -99,12 +99,6 @@ def _deepest(grasp: Grasp, measured: Array, hand: HandShape) -> float:
     """Return the depth of the deepest confirmed point in the hand, on its approach and closed [m]."""
     retreat = float(np.linalg.norm(grasp.T_world_tcp[:3, 3] - grasp.T_world_pregrasp[:3, 3]))
     return max(
-        float(hand_penetration(_hands(grasp, grasp.opening), measured, hand, retreat=retreat)[0]),
-        float(hand_penetration(_hands(grasp, grasp.width), measured, hand, retreat=0.0)[0]),
+        float(hand_penetration(Hands.one(grasp.T_world_tcp, grasp.opening), measured, hand, retreat=retreat)[0]),
+        float(hand_penetration(Hands.one(grasp.T_world_tcp, grasp.width), measured, hand, retreat=0.0)[0]),
     )
-
-
-def _hands(grasp: Grasp, opening: float) -> Hands:
-    """Return the hand of a grasp with another opening [m]."""
-    zero = np.zeros(1)
-    return Hands(grasp.T_world_tcp[None], np.zeros(1, np.int64), np.array([opening]), *[zero] * 4)

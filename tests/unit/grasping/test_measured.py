@@ -32,11 +32,6 @@ CAMERA = Camera(300.0, 300.0, 159.5, 119.5, 320, 240)
 HAND = panda().hand
 
 
-def hands_at(T: Array, opening: float) -> Hands:
-    zero = np.zeros(1)
-    return Hands(T[None], np.zeros(1, np.int64), np.array([opening]), zero, zero, zero, zero)
-
-
 def views(*solids: Solid, turns: Array | None = None) -> list[DepthView]:
     """Render exact depth images of solids from a ring around the box."""
     stage = RaycastScene([RaycastSurface(solid_mesh(solid), Texture((0.5,) * 3, (0.5,) * 3)) for solid in solids])
@@ -84,7 +79,7 @@ def test_penetration_equals_the_distance_from_the_nearest_face_in_float64(seed: 
     T = se3_exp(np.r_[rng.uniform(-2, 2, 3), rng.uniform(-1.5, 1.5, 3)])
     local = rng.uniform((-0.06, -0.1, -0.25), (0.06, 0.1, 0.05), (60, 3))
     opening = float(rng.uniform(0.0, 0.08))
-    got = hand_penetration(hands_at(T, opening), transform_points(T, local), HAND, retreat=retreat)
+    got = hand_penetration(Hands.one(T, opening), transform_points(T, local), HAND, retreat=retreat)
     assert got[0] == pytest.approx(by_boxes(local, opening, HAND, retreat), abs=2e-6)  # float32 at 2 m
 
 
@@ -94,7 +89,7 @@ def test_fingers_stop_where_a_point_would_be_deeper_than_the_tolerance(seed: int
     rng = np.random.default_rng(seed)
     T = se3_exp(np.r_[rng.uniform(-2, 2, 3), rng.uniform(-1.5, 1.5, 3)])
     local = rng.uniform((-0.02, -0.03, -0.04), (0.02, 0.03, 0.02), (60, 3))
-    at = hands_at(T, 0.08)
+    at = Hands.one(T, 0.08)
     width = float(closed_width(at, transform_points(T, local), HAND)[0])
     assert by_boxes(local, width, HAND, 0.0) <= CONSTANTS.max_penetration + 2e-6
     assert by_boxes(local, width - 1e-4, HAND, 0.0) > CONSTANTS.max_penetration
@@ -104,8 +99,8 @@ def test_depth_between_the_pads_and_no_depth_at_all_are_no_penetration() -> None
     assert HAND is not None
     T = np.eye(4)
     between = np.array([[0.0, 0.0, 0.0], [0.004, 0.019, 0.003]])
-    assert hand_penetration(hands_at(T, 0.04), between, HAND, retreat=0.1)[0] == 0.0
-    assert hand_penetration(hands_at(T, 0.04), np.zeros((0, 3)), HAND, retreat=0.1)[0] == 0.0
+    assert hand_penetration(Hands.one(T, 0.04), between, HAND, retreat=0.1)[0] == 0.0
+    assert hand_penetration(Hands.one(T, 0.04), np.zeros((0, 3)), HAND, retreat=0.1)[0] == 0.0
     assert np.isinf(contact_distances(np.zeros((2, 3)), np.zeros((0, 3)))).all()
 
 
@@ -137,7 +132,7 @@ def test_no_hand_is_offered_in_an_obstacle_that_only_depth_shows() -> None:
 
     def deep(result: GraspResult) -> list[float]:
         return [
-            float(hand_penetration(hands_at(g.T_world_tcp, g.opening), measured, HAND, retreat=0.1)[0])
+            float(hand_penetration(Hands.one(g.T_world_tcp, g.opening), measured, HAND, retreat=0.1)[0])
             for g in result.grasps
         ]
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -108,3 +110,9 @@ def test_robots_without_shapes_show_their_spheres() -> None:
     assert len(parts) == len(spheres.radii)
     for part, center, radius in list(zip(parts, spheres.centers, spheres.radii, strict=True))[::40]:
         np.testing.assert_allclose(np.linalg.norm(part.triangles - center, axis=2), radius, rtol=1e-6)
+
+
+def test_another_arm_with_the_name_of_a_panda_is_not_drawn_as_one() -> None:
+    robot = load_robot("ur5e")
+    assert len(appearance(replace(robot, name="panda"))) == len(appearance(robot))
+    assert len(appearance(replace(robot, name="panda-lab"))) == len(appearance(robot))
