@@ -342,11 +342,8 @@ class Search:
         reached = reach.reach(grasp.T_world_tcp, grasp.T_world_pregrasp, grasp.opening)
         if reached.q is None or reached.path is None:
             return replace(grasp, rejected=reached.reason), reached.kind
-        terms = dict(grasp.terms) | arm_terms(reached)
-        total = float(totals({name: np.array([value]) for name, value in terms.items()})[0])
-        q = reached.q
-        found = replace(grasp, terms=terms, total=total, q=q, q_pregrasp=reached.path[0], approach_path=reached.path)
-        return found, ""
+        found = _with_terms(grasp, arm_terms(reached))
+        return replace(found, q=reached.q, q_pregrasp=reached.path[0], approach_path=reached.path), ""
 
     def _at_full_density(self, grasp: Grasp, raw: RawDepth) -> tuple[Grasp, str]:
         """Check the fingers with all confirmed points around them; the kind of rejection is empty if they are free."""
@@ -358,7 +355,8 @@ class Search:
         width = max(grasp.width, float(closed_width(hands, points, self.s.hand)[0]))
         assert grasp.depth_distance is not None
         away = np.minimum(grasp.depth_distance, contact_distances(grasp.contacts, points))
-        return replace(grasp, width=width, depth_distance=away), ""
+        measured = float((away <= MEASURED.contact_distance).mean())
+        return replace(_with_terms(grasp, {"measured": measured}), width=width, depth_distance=away), ""
 
     def _scored(self, hands: Hands, clearance: Array) -> _Scored:
         terms = hand_terms(
@@ -452,6 +450,13 @@ class Search:
                 f"{opens:.0f} mm."
             )
         return tuple(notes)
+
+
+def _with_terms(grasp: Grasp, terms: Mapping[str, float]) -> Grasp:
+    """Return a grasp with further or other score terms, and their total."""
+    known = {**grasp.terms, **terms}
+    total = float(totals({name: np.array([value]) for name, value in known.items()})[0])
+    return replace(grasp, terms=known, total=total)
 
 
 def _deep(clearance: float) -> str:
