@@ -22,6 +22,8 @@ class MeasuredDepthConstants:
 
     Args:
         max_penetration: [m] accepted depth of a confirmed point in fingers or palm.
+        pad_penetration: [m] depth of a confirmed point in a closing finger at which it stops. It is smaller, because
+            the frames that the search does not read confirm further points.
         contact_distance: [m] largest distance of a measured contact from the nearest confirmed point.
         spacing: [m] edge of the voxels in which each frame proposes one point.
         fine_spacing: [m] the same for the last check of one grasp.
@@ -30,6 +32,7 @@ class MeasuredDepthConstants:
     """
 
     max_penetration: float = 0.003
+    pad_penetration: float = 0.002
     contact_distance: float = 0.003
     spacing: float = 0.003
     fine_spacing: float = 0.001
@@ -115,7 +118,7 @@ def hand_penetration(hands: Hands, points: Array, hand: HandShape, *, retreat: f
 
 
 def closed_width(hands: Hands, points: Array, hand: HandShape) -> Array:
-    """Return the smallest width (K,) [m] between the fingers at which no point between them is deeper than 3 mm.
+    """Return the smallest width (K,) [m] between the fingers at which no point between them is deeper than 2 mm.
 
     The fingers close until they meet the object. Depth of a point in a finger is defined as in
     :func:`hand_penetration`. The width is 0 if no point is between the fingers.
@@ -125,7 +128,7 @@ def closed_width(hands: Hands, points: Array, hand: HandShape) -> Array:
         points: (S, 3) measured points [m, world].
         hand: shape of the hand.
     """
-    width, deep = np.zeros(len(hands)), CONSTANTS.max_penetration
+    width, deep = np.zeros(len(hands)), CONSTANTS.pad_penetration
     for k, (x, y, z) in _local_points(hands, points):
         inner = hands.opening[k, None].astype(np.float32) / 2
         between = (x < hand.width / 2 - deep) & (y < inner) & (z < hand.tip - deep) & (z > -hand.palm)

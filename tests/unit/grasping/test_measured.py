@@ -91,8 +91,9 @@ def test_fingers_stop_where_a_point_would_be_deeper_than_the_tolerance(seed: int
     local = rng.uniform((-0.02, -0.03, -0.04), (0.02, 0.03, 0.02), (60, 3))
     at = Hands.one(T, 0.08)
     width = float(closed_width(at, transform_points(T, local), HAND)[0])
-    assert by_boxes(local, width, HAND, 0.0) <= CONSTANTS.max_penetration + 2e-6
-    assert by_boxes(local, width - 1e-4, HAND, 0.0) > CONSTANTS.max_penetration
+    assert by_boxes(local, width, HAND, 0.0) <= CONSTANTS.pad_penetration + 2e-6
+    assert by_boxes(local, width - 1e-4, HAND, 0.0) > CONSTANTS.pad_penetration
+    assert CONSTANTS.pad_penetration < CONSTANTS.max_penetration
 
 
 def test_depth_between_the_pads_and_no_depth_at_all_are_no_penetration() -> None:
