@@ -13,6 +13,8 @@ import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, TextIO
 
+from splatbot.cli.messages import print_message
+
 
 class _Command(NamedTuple):
     module: str
@@ -88,7 +90,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except SplatbotError as error:
         if debug:
             traceback.print_exc()
-        print(f"error: {error}", file=sys.stderr)
+        print_message("error", error)
         return error.exit_code
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
@@ -104,7 +106,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         if debug:
             traceback.print_exc()
-        print(f"error: {sentence}", file=sys.stderr)
+        print_message("error", sentence)
         return 1
 
 
@@ -118,7 +120,7 @@ def _print_warning(
 ) -> None:
     """Print warnings about the user's input as one line; those for developers keep their place in the code."""
     place = "" if category.__module__.startswith("splatbot") else f"{filename}:{lineno}: "
-    print(f"warning: {place}{message}", file=file or sys.stderr)
+    print_message("warning", f"{place}{message}", file)
 
 
 def _dispatch(words: list[str]) -> Any:

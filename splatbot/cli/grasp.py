@@ -234,7 +234,7 @@ def _view(map_: Path, index: int) -> ObservedView:
 def _print(result: GraspResult, folder: Path) -> None:
     from rich.table import Table
 
-    from splatbot.cli.tables import print_columns, print_table
+    from splatbot.cli.tables import print_columns, print_table, print_text
 
     target = result.target
     seconds = sum(result.seconds.values())
@@ -256,6 +256,6 @@ def _print(result: GraspResult, folder: Path) -> None:
         values = (f"{g.terms[name]:.2f}" for name in terms)
         table.add_row(str(k), f"{g.total:.3f}", f"{g.confidence:.2f}", g.approach, *lengths, *contact, *values)
     print_columns(table)
-    print("the best total and the best value of a term is 1")
+    print_text("the best total and the best value of a term is 1")
     if contacts:
-        print("a measured contact is within 3 mm of depth that three frames agree on; an implied one is not")
+        print_text("a measured contact is within 3 mm of depth that three frames agree on; an implied one is not")

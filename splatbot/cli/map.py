@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from splatbot.cli.doubts import camera_doubts, run_doubts
+from splatbot.cli.messages import print_message
 from splatbot.cli.paths import check_camera, check_file, check_output, check_state
 from splatbot.errors import InputError
 from splatbot.layouts import MAP_NAME, log_kind
@@ -111,7 +111,7 @@ def map_log_command(
     recording = without_robot(open_log(log, camera=camera), robot)
     if not quiet:
         for doubt in camera_doubts(recording.camera):
-            print(f"question: {doubt}", file=sys.stderr)
+            print_message("question", doubt)
     folder = out if out is not None else Path("runs") / f"{_slug(recording.name)}-{datetime.now():%Y%m%d-%H%M%S}"
     with progress_display(quiet=quiet) as on_progress:
         result = map_log(
@@ -134,7 +134,7 @@ def map_log_command(
     if not quiet:
         _print_summary(result)
     if result.error is not None:
-        print(f"error: {result.error}", file=sys.stderr)
+        print_message("error", result.error)
     return result.exit_code
 
 

@@ -27,6 +27,11 @@ def print_table(rows: Sequence[tuple[str, str]], *, title: str | None = None) ->
             print(f"  {'':<{width}}  {line}")
 
 
+def print_text(text: str) -> None:
+    """Print a paragraph: one line in a file; at a terminal, lines that fit it."""
+    print("\n".join(_wrapped(text, 0)))
+
+
 def _wrapped(value: str, indent: int) -> list[str]:
     """Return the lines of a value; paths and other long words are not broken, so that they can be copied."""
     if not sys.stdout.isatty():
