@@ -111,6 +111,7 @@ def server_config(app: FastAPI, settings: ServiceSettings) -> uvicorn.Config:
         access_log=False,  # the application's names the request's id, and no query
         timeout_graceful_shutdown=settings.shutdown_s,
         ws_max_size=settings.max_message_bytes,
+        ws_per_message_deflate=False,  # a few kB inflate on the event loop to the largest message
         ssl_certfile=settings.tls_cert,
         ssl_keyfile=settings.tls_key,
         server_header=False,

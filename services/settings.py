@@ -62,7 +62,7 @@ class ServiceSettings(BaseSettings):
     max_body_bytes: int = Field(16 * 2**20, ge=1024, description="size of a request's body [bytes]")
     max_upload_bytes: int = Field(2**30, ge=1024, description="size of an uploaded recording, packed [bytes]")
     max_unpacked_bytes: int = Field(4 * 2**30, ge=1024, description="size of an uploaded recording, unpacked [bytes]")
-    max_message_bytes: int = Field(32 * 2**20, ge=1024, description="size of one WebSocket message [bytes]")
+    max_message_bytes: int = Field(16 * 2**20, ge=1024, description="size of one WebSocket message [bytes]")
     max_requests: int = Field(128, ge=1, description="requests that are open at once; more are answered 503")
     max_waiting: int = Field(64, ge=1, description="requests of one kind that may wait; more are answered 503")
     requests_per_s: float = Field(500.0, gt=0, description="of one client in the long run; more are answered 429")

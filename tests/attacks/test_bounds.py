@@ -7,6 +7,7 @@ import json
 import struct
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,8 @@ import msgpack
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from websockets.exceptions import ConnectionClosed
+from websockets.frames import CloseCode
 
 from splatbot.errors import InputError
 from splatbot.logs.index import associate
@@ -186,9 +189,9 @@ def test_a_packed_array_that_cannot_be_is_refused(service: Victim, dtype: str, s
 
 
 MESSAGES = {
-    "empty lists": '{"op": "publish", "topic": "/x", "msg": {"a": [' + "[]," * 8_000_000 + "[]]}}",
-    "texts": '{"op": "publish", "topic": "/x", "msg": {"a": [' + '"",' * 8_000_000 + '""]}}',
-    "objects": '{"op": "publish", "topic": "/x", "msg": {"a": [' + "{}," * 8_000_000 + "{}]}}",
+    "empty lists": '{"op": "publish", "topic": "/x", "msg": {"a": [' + "[]," * (SIZE // 3 - 50) + "[]]}}",
+    "texts": '{"op": "publish", "topic": "/x", "msg": {"a": [' + '"",' * (SIZE // 3 - 50) + '""]}}',
+    "objects": '{"op": "publish", "topic": "/x", "msg": {"a": [' + "{}," * (SIZE // 3 - 50) + "{}]}}",
     "deep": '{"op": "publish", "topic": "/x", "msg": ' + "[" * 8_000_000,
     "messages": '{"op": "publish", "topic": "/markers", "msg": {"markers": [' + "{}," * 190_000 + "{}]}}",
 }
@@ -207,6 +210,27 @@ def test_a_message_of_millions_of_values_is_refused_before_objects_are_made(serv
         answer = json.loads(asyncio.run(ask()))
     assert (answer["op"], answer["level"]) == ("status", "error")
     assert "Fix:" in answer["msg"], answer
+
+
+def test_a_message_that_is_too_long_ends_its_connection_before_it_is_read(service: Victim) -> None:
+    async def closed() -> int | None:
+        async with service.rosbridge() as socket:
+            with suppress(ConnectionClosed):  # while it still sends
+                await socket.send("[]," * 8_000_000)
+            await asyncio.wait_for(socket.wait_closed(), 20)
+            return socket.close_code
+
+    with service.attacked(memory=20):
+        code = asyncio.run(closed())
+    assert code == CloseCode.MESSAGE_TOO_BIG
+
+
+def test_a_socket_inflates_no_message_that_a_client_compressed(service: Victim) -> None:
+    async def extensions() -> list[str]:
+        async with service.rosbridge() as socket:  # offers permessage-deflate, as browsers do
+            return [extension.name for extension in socket.protocol.extensions]
+
+    assert asyncio.run(extensions()) == []
 
 
 SIDES = [(2_100_000, 1), (1, 2_100_000), (100_000, 21), (10**9, 10**9)]

@@ -16,7 +16,7 @@ from typing import Any
 
 import httpx
 import numpy as np
-import websockets
+from websockets.asyncio.client import connect
 
 from splatbot.services.server import warm_process
 from splatbot.services.settings import ServiceSettings
@@ -40,11 +40,11 @@ class Victim:
         lines = Path(f"/proc/{self.pid}/status").read_text().splitlines()
         return next(int(line.split()[1]) for line in lines if line.startswith(kind)) / 1024
 
-    def rosbridge(self) -> websockets.connect:
+    def rosbridge(self) -> connect:
         """Connect to rosbridge with the client's key; messages may have any size."""
         url = self.url.replace("http", "ws") + "/rosbridge"
         headers = {name: value for name, value in self.client.headers.items() if name == "authorization"}
-        return websockets.connect(url, max_size=None, additional_headers=headers)
+        return connect(url, max_size=None, additional_headers=headers)
 
     @contextmanager
     def attacked(self, *, memory: float = MEMORY, seconds: float = SECONDS) -> Iterator[None]:
