@@ -52,7 +52,7 @@ def render_default(
     mode: Annotated[Mode, Query(examples=["rgb"])] = "rgb",
     width: Annotated[int, Query(ge=1, examples=[640])] = 640,
     height: Annotated[int, Query(ge=1, examples=[480])] = 480,
-    fov_deg: Annotated[float, Query(gt=0, lt=180, examples=[60.0])] = 60.0,
+    fov_deg: Annotated[float, Query(ge=1e-3, lt=180, examples=[60.0])] = 60.0,
 ) -> Response:
     """Render the whole map for a browser, along the world's z axis with 90 % of it in view."""
     check_size(width, height, settings)

@@ -129,10 +129,10 @@ def default_view(
         fov_deg: horizontal field of view [deg].
 
     Raises:
-        InputError: the field of view is not between 0 and 180 degrees.
+        InputError: the field of view is not between 0.001 and 180 degrees.
     """
-    if not 0.0 < fov_deg < 180.0:
-        raise InputError(f"is {fov_deg}.", field="fov_deg", hint="give degrees between 0 and 180")
+    if not 1e-3 <= fov_deg < 180.0:  # narrower, the focal length overflows
+        raise InputError(f"is {fov_deg}.", field="fov_deg", hint="give degrees between 0.001 and 180")
     focal = 0.5 * width / np.tan(np.radians(fov_deg) / 2)
     camera = Camera(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height)
     T_world_camera = np.eye(4)

@@ -1,0 +1,80 @@
+"""Sequences of requests that use each other's answers (schemathesis, stateful): maps, jobs, plans, leases."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from splatbot.services.settings import ServiceSettings
+from splatbot.services.store import MapStore
+from tests.contracts.conftest import Service, running, wall
+
+SETTINGS = ServiceSettings(
+    max_plan_ms=100, max_views=2, max_pixels=20_000, max_frames=3, max_jobs=4, requests_per_s=1e6, max_requests=512
+)
+WORKFLOWS, STEPS = 60, 25
+FOLLOWED = 100  # requests that take a value of an earlier answer
+
+
+@pytest.fixture
+def api() -> Iterator[Service]:
+    store = MapStore()
+    store.add("default", source="wall.ply", state="static", snapshot=wall())
+    with running(SETTINGS, store) as service:
+        yield service
+
+
+@pytest.mark.long
+def test_requests_that_use_each_others_answers_meet_no_fault_and_nothing_deleted_is_served(api: Service) -> None:
+    schemathesis = pytest.importorskip("schemathesis", reason="schemathesis is not installed")
+    from hypothesis import HealthCheck, Phase, settings
+    from schemathesis.specs.openapi.checks import ensure_resource_availability, use_after_free
+
+    document = api.client.get("/openapi.json").json()
+    del document["security"]  # each request below has the key
+    del document["paths"]["/v1/maps/{map_id}/upload"]  # takes a zip alone, and has tests of its own
+    for path in [path for path in document["paths"] if path.endswith("/events")]:
+        del document["paths"][path]  # streams without an end
+    for item in document["paths"].values():
+        for operation in item.values():
+            content = operation.get("requestBody", {}).get("content", {})
+            for kind in set(content) - {"application/json"}:
+                del content[kind]
+    schema = schemathesis.openapi.from_dict(document)
+    schema.config.update(base_url=api.url)
+    statuses: Counter[int] = Counter()
+    followed: Counter[str] = Counter()
+
+    class Workflow(schema.as_state_machine()):  # type: ignore[misc]
+        def get_call_kwargs(self, case: Any) -> dict[str, Any]:
+            return {"headers": {"Authorization": f"Bearer {api.key}"}}
+
+        def step(self, input: Any) -> Any:
+            if input.transition is not None:
+                followed[input.transition.id] += 1
+            return super().step(input)
+
+        def validate_response(self, response: Any, case: Any, *args: Any, **kwargs: Any) -> None:
+            statuses[response.status_code] += 1
+            assert response.status_code != 500, (case.method, case.path, response.text)
+            case.validate_response(response, checks=[use_after_free, ensure_resource_availability])
+
+    some = settings(
+        max_examples=WORKFLOWS,
+        stateful_step_count=STEPS,
+        deadline=None,
+        database=None,
+        derandomize=True,
+        phases=(Phase.generate,),
+        suppress_health_check=list(HealthCheck),
+    )
+    Workflow.run(settings=some)
+    print(
+        f"{statuses.total()} requests, {followed.total()} of them with a value of an earlier answer: {dict(statuses)}"
+    )
+    assert {200, 201, 202, 204, 404, 409, 422} <= set(statuses)
+    assert followed.total() >= FOLLOWED
+    assert api.client.get("/healthz").status_code == 200
