@@ -1,7 +1,8 @@
 """Appearance of arms in pictures: triangles of links and fingers with their colours.
 
-The Panda's are Franka's visual meshes (Apache-2.0), simplified. Other robots show the shapes of the twin, and without
-these the spheres of their certified body. Pictures alone use them; no check does.
+The Panda's are Franka's visual meshes (Apache-2.0), simplified. Other arms show the visual meshes of their description,
+which are stored with them, and hands the shapes of the twin. A link without these shows its certified spheres. Pictures
+alone use them; no check does.
 
 `python -m splatbot.robots.appearance` makes the stored meshes from those of :mod:`splatbot.robots.maker_meshes`.
 """
@@ -24,10 +25,9 @@ from splatbot.report.robot_drawing import Color, DrawnPart
 from splatbot.robots.maker_meshes import SOURCES, Source
 from splatbot.robots.panda import T_LINK_HAND, panda
 from splatbot.robots.robot import RobotModel
+from splatbot.robots.visual import MOST_TRIANGLES, STEP, simplify
 
 _FILE = Path(__file__).parent / "bodies" / "panda_appearance.npz"
-_STEP = 1e-5  # [m] resolution of the stored corners
-_TRIANGLES = 1500  # of a part, at most
 _LIGHT, _DARK = (0.90, 0.90, 0.91), (0.30, 0.31, 0.33)
 _GREY = (200, 200, 200)  # of a mesh without a material
 
@@ -47,17 +47,19 @@ def appearance(robot: RobotModel, opening: float | None = None) -> list[DrawnPar
         ]
         fingers = ((piece.triangles, piece.color) for piece in meshes["finger"])
         return parts + [part for triangles, color in fingers for part in _fingers(robot, triangles, color, opening)]
-    drawn = {part.link for part in parts} - {last}  # a hand on the last link is not the Panda's own
-    shapes = [DrawnPart(shape.link, shape.triangles(), _DARK) for shape in robot.shapes if shape.link not in drawn]
+    parts += [DrawnPart(mesh.link, mesh.triangles(), _LIGHT) for mesh in robot.visual]
+    arm = {part.link for part in parts}
+    parts += [
+        DrawnPart(shape.link, shape.triangles(), _DARK) for shape in robot.shapes if shape.link not in arm - {last}
+    ]
     if robot.gripper is not None and robot.gripper.shapes:
         own = np.concatenate([shape.triangles() for shape in robot.gripper.shapes])
-        shapes += _fingers(robot, own, _DARK, opening)
-    if shapes:
-        return parts + shapes
-    spheres = robot.spheres(opening)
-    return [
+        parts += _fingers(robot, own, _DARK, opening)
+    drawn, spheres = {part.link for part in parts}, robot.spheres(opening)
+    return parts + [
         DrawnPart(int(link), np.asarray(center + radius * _ball()), _LIGHT)
         for link, center, radius in zip(spheres.link, spheres.centers, spheres.radii, strict=True)
+        if link not in drawn
     ]
 
 
@@ -94,7 +96,7 @@ def _panda_meshes() -> dict[str, list[DrawnPart]]:
         with np.load(_FILE) as stored:
             for name in stored.files:
                 if name.count("/") == 1:
-                    triangles = _STEP * stored[name].astype(np.float64)[stored[f"{name}/faces"]]
+                    triangles = STEP * stored[name].astype(np.float64)[stored[f"{name}/faces"]]
                     red, green, blue = (float(value) / 255 for value in stored[f"{name}/color"])
                     found.setdefault(name.split("/")[0], []).append(DrawnPart(0, triangles, (red, green, blue)))
     except (OSError, ValueError, KeyError) as error:
@@ -123,16 +125,10 @@ def save_appearance(source: Source, path: Path) -> None:
         for k, (color, same) in enumerate(by_color.items()):
             joined = trimesh.util.concatenate(same)
             assert isinstance(joined, trimesh.Trimesh)
-            mesh = o3d.geometry.TriangleMesh(
-                o3d.utility.Vector3dVector(unit * joined.vertices), o3d.utility.Vector3iVector(joined.faces)
-            )
-            mesh = mesh.merge_close_vertices(_STEP).remove_degenerate_triangles()
-            most = max(60, _TRIANGLES * len(joined.faces) // total)
-            if len(mesh.triangles) > most:
-                mesh = mesh.simplify_quadric_decimation(most)
-            mesh.remove_unreferenced_vertices()
+            most = max(60, MOST_TRIANGLES * len(joined.faces) // total)
+            mesh = simplify(unit * joined.vertices, joined.faces, most)
             name = f"{part}/{k}"
-            stored[name] = np.rint(np.asarray(mesh.vertices) / _STEP).astype(np.int32)
+            stored[name] = np.rint(np.asarray(mesh.vertices) / STEP).astype(np.int32)
             stored[f"{name}/faces"] = np.asarray(mesh.triangles).astype(np.uint16)
             stored[f"{name}/color"] = np.array(color, np.uint8)
     with atomic_write(path) as file:

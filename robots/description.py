@@ -6,7 +6,9 @@ from pathlib import Path
 
 from splatbot.robots.mjcf_reader import read_mjcf
 from splatbot.robots.reading import Reading
+from splatbot.robots.shapes import Mesh
 from splatbot.robots.urdf import parse, read_urdf
+from splatbot.robots.visual import visual_meshes
 
 
 def read_description(path: str | Path, *, tip: str | None = None, slack: float | None = None) -> Reading:
@@ -25,3 +27,20 @@ def read_description(path: str | Path, *, tip: str | None = None, slack: float |
     if parse(file).tag == "mujoco":
         return read_mjcf(file, tip=tip, slack=slack)
     return read_urdf(file, tip=tip, slack=slack)
+
+
+def visual_of(path: str | Path, *, tip: str | None = None) -> tuple[Mesh, ...]:
+    """Return the visual meshes of an arm, simplified for pictures; those of an MJCF file are all its shapes.
+
+    Args:
+        path: the file.
+        tip: see :func:`read_description`.
+
+    Raises:
+        FormatError: see :func:`read_description`.
+    """
+    file = Path(path)
+    if parse(file).tag == "mujoco":
+        return visual_meshes(read_mjcf(file, tip=tip).robot.shapes)
+    seen = read_urdf(file, tip=tip, kinds=("visual",)).robot.shapes
+    return visual_meshes(seen or read_urdf(file, tip=tip).robot.shapes)

@@ -4,7 +4,7 @@ The 2F-85 has slim fingers for low or closely spaced objects. The 2F-140 grasps 
 
 Strokes, forces, masses and the length of the 2F-85 come from Robotiq's data sheets (85 mm, 20 to 235 N, 163 mm; 140 mm,
 10 to 125 N). The 2F-85 uses the force of the Panda's hand. Coarse shapes enclose the body, the open linkage and the
-fingers.
+fingers. The spheres of Franka's hand contain its meshes; its mass is that of Franka's data sheet.
 """
 
 from __future__ import annotations
@@ -17,58 +17,77 @@ import numpy as np
 
 from splatbot.errors import InputError
 from splatbot.geometry import transform_points
-from splatbot.protocols import Array
-from splatbot.robots.bodies import joined
+from splatbot.protocols import Array, HandShape, LinkSpheres
+from splatbot.robots.bodies import joined, load_body
 from splatbot.robots.cover import cover
-from splatbot.robots.panda import arm_spheres, panda
+from splatbot.robots.panda import FINGERS, HAND, HAND_TCP, arm_spheres, finger_shapes, hand_shapes, panda
 from splatbot.robots.robot import CONSTANTS as COVER
 from splatbot.robots.robot import GripperGeometry, Inertial, RobotModel
-from splatbot.robots.shapes import Capsule
+from splatbot.robots.shapes import Box, Capsule, Mesh, Shape
 
 _FLANGE = 0.107  # [m] of the Panda's last link
-_Along = tuple[tuple[float, float, float], tuple[float, float, float], float]  # ends and radius of a capsule [m]
 _WRIST = 3  # links before the last one that a hand may touch at home
 _TURNED = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 
 @dataclass(frozen=True, eq=False)
 class Hand:
-    """A hand whose two fingers open along the y axis of its flange and reach along the z axis.
+    """A hand whose two fingers open along the y axis of its tool frame and reach along the z axis.
 
     Args:
         name: suffix of the name of the robot that carries it.
-        tcp: distance of the tool frame, which lies between the pads, from the flange [m].
-        body: capsules of the hand in the frame of the flange [m].
-        root: distance of the roots of the fingers from the flange [m].
-        finger: capsules of one finger in its own frame [m].
+        T_flange_tcp: (4, 4) pose of the tool frame, which lies between the pads, on the flange [m].
+        body: shapes of the hand in the frame of the flange [m]; their ``link`` is ignored.
+        T_flange_finger: (2, 4, 4) pose of each closed finger [m]; its y axis points in the direction of opening.
+        finger: shapes of one finger in its own frame [m].
         stroke: travel of each finger [m].
         force: force between the fingers [N].
         speed: speed of each finger [m/s].
         mass: of the hand [kg].
+        body_covering: spheres of the hand in the frame of the flange. If None, they are generated from ``body``.
+        finger_covering: spheres of one finger in its own frame. If None, they are generated from ``finger``.
+        box: boxes around fingers and palm. If None, they are measured on the shapes.
     """
 
     name: str
-    tcp: float
-    body: Sequence[_Along]
-    root: float
-    finger: Sequence[_Along]
+    T_flange_tcp: Array
+    body: Sequence[Shape]
+    T_flange_finger: Array
+    finger: Sequence[Shape]
     stroke: float
     force: float
     speed: float
     mass: float
+    body_covering: LinkSpheres | None = None
+    finger_covering: LinkSpheres | None = None
+    box: HandShape | None = None
+
+
+def _along_z(z: float) -> Array:
+    T = np.eye(4)
+    T[2, 3] = z
+    return T
+
+
+def roots(z: float) -> Array:
+    """Return poses (2, 4, 4) of two fingers that face each other, at a distance ``z`` [m] from the flange."""
+    return np.stack([_along_z(z) @ turn for turn in (np.eye(4), _TURNED)])
 
 
 ROBOTIQ_2F85 = Hand(
     "2f85",
-    tcp=0.145,
-    body=(((0.0, 0.0, 0.02), (0.0, 0.0, 0.06), 0.04), ((0.0, -0.05, 0.085), (0.0, 0.05, 0.085), 0.02)),
-    root=0.09,
+    T_flange_tcp=_along_z(0.145),
+    body=(
+        Capsule(0, (0.0, 0.0, 0.02), (0.0, 0.0, 0.06), 0.04),
+        Capsule(0, (0.0, -0.05, 0.085), (0.0, 0.05, 0.085), 0.02),
+    ),
+    T_flange_finger=roots(0.09),
     # 22 mm wide and, up to 38 mm from their tips, 10 mm thick with round edges. Checks with the target use boxes of the
     # thickness at the roots, 20 mm.
     finger=(
-        ((-0.006, 0.005, 0.0), (-0.006, 0.005, 0.068), 0.005),
-        ((0.006, 0.005, 0.0), (0.006, 0.005, 0.068), 0.005),
-        ((0.0, 0.01, 0.0), (0.0, 0.01, 0.025), 0.01),
+        Capsule(0, (-0.006, 0.005, 0.0), (-0.006, 0.005, 0.068), 0.005),
+        Capsule(0, (0.006, 0.005, 0.0), (0.006, 0.005, 0.068), 0.005),
+        Capsule(0, (0.0, 0.01, 0.0), (0.0, 0.01, 0.025), 0.01),
     ),
     stroke=0.0425,
     force=70.0,
@@ -77,16 +96,41 @@ ROBOTIQ_2F85 = Hand(
 )
 ROBOTIQ_2F140 = Hand(
     "2f140",
-    tcp=0.205,
-    body=(((0.0, 0.0, 0.02), (0.0, 0.0, 0.075), 0.045), ((0.0, -0.07, 0.105), (0.0, 0.07, 0.105), 0.03)),
-    root=0.135,
-    finger=(((0.0, 0.0125, 0.0), (0.0, 0.0125, 0.07), 0.0125),),
+    T_flange_tcp=_along_z(0.205),
+    body=(
+        Capsule(0, (0.0, 0.0, 0.02), (0.0, 0.0, 0.075), 0.045),
+        Capsule(0, (0.0, -0.07, 0.105), (0.0, 0.07, 0.105), 0.03),
+    ),
+    T_flange_finger=roots(0.135),
+    finger=(Capsule(0, (0.0, 0.0125, 0.0), (0.0, 0.0125, 0.07), 0.0125),),
     stroke=0.07,
     force=125.0,
     speed=0.15,
     mass=1.025,
 )
-HANDS = {hand.name: hand for hand in (ROBOTIQ_2F85, ROBOTIQ_2F140)}
+
+
+@cache
+def franka_hand() -> Hand:
+    """Return Franka's hand, whose certified body is that of the Panda."""
+    body = load_body("panda")
+    return Hand(
+        "panda_hand",
+        T_flange_tcp=_along_z(HAND_TCP),
+        body=hand_shapes(),
+        T_flange_finger=roots(FINGERS),
+        finger=finger_shapes(),
+        stroke=0.04,
+        force=70.0,
+        speed=0.05,
+        mass=0.73,
+        body_covering=body.on("hand", 0),
+        finger_covering=body.on("finger", 0),
+        box=HAND,
+    )
+
+
+HAND_NAMES = ("2f85", "2f140", "panda_hand")
 
 
 def find_hand(name: str) -> Hand:
@@ -95,43 +139,44 @@ def find_hand(name: str) -> Hand:
     Raises:
         InputError: there is no such hand.
     """
-    if name not in HANDS:
-        raise InputError(f"is {name!r}.", field="gripper", hint=f"grippers: {', '.join(HANDS)}")
-    return HANDS[name]
+    if name not in HAND_NAMES:
+        hint = f"grippers: {', '.join(HAND_NAMES)}, or the URDF of a parallel gripper"
+        raise InputError(f"is {name!r}.", field="gripper", hint=hint)
+    return franka_hand() if name == "panda_hand" else {h.name: h for h in (ROBOTIQ_2F85, ROBOTIQ_2F140)}[name]
 
 
-def attach(arm: RobotModel, name: str) -> RobotModel:
+def attach(arm: RobotModel, hand: Hand) -> RobotModel:
     """Attach a hand to the tool frame of an arm, whose z axis points away from the arm.
 
     The hand is a point mass in the twin. Links of the wrist that it touches at home are not checked against it.
 
     Args:
         arm: an arm without a gripper.
-        name: of :data:`HANDS`.
+        hand: the hand.
 
     Raises:
-        InputError: there is no such hand, or the arm has a gripper.
+        InputError: the arm has a gripper.
     """
-    hand, last, flange = find_hand(name), len(arm), arm.T_link_tcp
+    last, flange = len(arm), arm.T_link_tcp
     if arm.gripper is not None:
         raise InputError("has a gripper.", field=arm.name, hint="attach a hand to an arm without one")
-    body = _moved(hand.body, flange, last)
-    finger = tuple(Capsule(0, *along) for along in hand.finger)
-    middle = transform_points(flange, np.array([0.0, 0.0, hand.tcp / 2]))
+    body = tuple(moved(shape, flange, last) for shape in hand.body)
+    middle = transform_points(flange, hand.T_flange_tcp[:3, 3] / 2)
     parts = [(i.mass, np.asarray(i.center), i.inertia) for i in arm.inertials[-1:]]
     robot = replace(
         arm,
         name=f"{arm.name}-{hand.name}",
         shapes=(*arm.shapes, *body),
-        covering=joined(arm.spheres(), cover(body, COVER.slack)),
-        T_link_tcp=flange @ _along_z(hand.tcp),
+        covering=joined(arm.spheres(), _spheres(hand, flange, last)),
+        T_link_tcp=flange @ hand.T_flange_tcp,
         gripper=GripperGeometry(
-            np.stack([flange @ _along_z(hand.root) @ turn for turn in (np.eye(4), _TURNED)]),
+            flange @ hand.T_flange_finger,
             hand.stroke,
-            finger,
+            tuple(hand.finger),
             speed=hand.speed,
             force=hand.force,
-            covering=cover(finger, COVER.slack / 2),
+            covering=hand.finger_covering or cover(hand.finger, COVER.slack / 2),
+            hand=hand.box,
         ),
         inertials=(*arm.inertials[:-1], Inertial.summed([*parts, (hand.mass, middle, np.zeros((3, 3)))]))
         if arm.inertials
@@ -167,23 +212,27 @@ def _panda_with(hand: Hand) -> RobotModel:
         T_link_tcp=_along_z(_FLANGE),
         gripper=None,
     )
-    return replace(attach(bare, hand.name), inertials=arm.inertials)
+    return replace(attach(bare, hand), inertials=arm.inertials)
 
 
-def _moved(capsules: Sequence[_Along], T_link_flange: Array, link: int) -> tuple[Capsule, ...]:
-    """Return capsules of the flange's frame as those of a link."""
-    found = []
-    for a, b, radius in capsules:
-        start, end = transform_points(T_link_flange, np.array([a, b]))
-        found.append(Capsule(link, _point(start), _point(end), radius))
-    return tuple(found)
+def _spheres(hand: Hand, T_link_flange: Array, link: int) -> LinkSpheres:
+    """Return the spheres of a hand's body on a link."""
+    own = hand.body_covering
+    if own is None:
+        return cover([moved(shape, T_link_flange, link) for shape in hand.body], COVER.slack)
+    return LinkSpheres(np.full(len(own), link, np.int32), transform_points(T_link_flange, own.centers), own.radii)
+
+
+def moved(shape: Shape, T_link_flange: Array, link: int) -> Shape:
+    """Return a shape of the flange's frame as that of a link."""
+    if isinstance(shape, Mesh):
+        return replace(shape, link=link, vertices=transform_points(T_link_flange, shape.vertices))
+    if isinstance(shape, Box):
+        return replace(shape, link=link, T_link_box=T_link_flange @ shape.T_link_box)
+    assert isinstance(shape, Capsule)
+    start, end = transform_points(T_link_flange, np.array([shape.start, shape.end]))
+    return Capsule(link, _point(start), _point(end), shape.radius)
 
 
 def _point(p: Array) -> tuple[float, float, float]:
     return float(p[0]), float(p[1]), float(p[2])
-
-
-def _along_z(z: float) -> Array:
-    T = np.eye(4)
-    T[2, 3] = z
-    return T

@@ -33,7 +33,9 @@ _VELOCITY = (2.1750, 2.1750, 2.1750, 2.1750, 2.6100, 2.6100, 2.6100)
 _ACCELERATION = (15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0)
 _JERK = (7500.0, 3750.0, 5000.0, 6250.0, 7500.0, 10000.0, 10000.0)
 _EFFORT = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0)
-_FLANGE, _HAND_YAW, _FINGERS, _TCP = 0.107, -np.pi / 4, 0.0584, 0.1034  # [m], [rad], [m] and [m] above the hand
+_FLANGE, _HAND_YAW = 0.107, -np.pi / 4  # [m] and [rad]
+FINGERS, HAND_TCP = 0.0584, 0.1034
+"""Distances of the roots of the fingers and of the tool frame from the flange of the hand [m]."""
 _HOME = (0.0, -0.3, 0.0, -2.2, 0.0, 2.0, np.pi / 4)
 
 # Mass, centre, and inertia (xx, yy, zz, xy, xz, yz) of the links 0..7, the hand with link 7.
@@ -48,8 +50,7 @@ _INERTIALS = (
     (1.495522, (0.0102, -0.0021, 0.0972), (0.0192, 0.0184, 0.0068, -0.0004, -0.0012, -0.0007)),
 )
 
-# Around the meshes of hand and fingers; the pads are those of the twin's fingers.
-_HAND = HandShape(
+HAND = HandShape(
     stroke=0.08,
     width=0.025,
     thickness=0.0265,
@@ -59,6 +60,8 @@ _HAND = HandShape(
     palm=0.0374,
     palm_size=(0.0634, 0.208),
 )
+"""Boxes around the meshes of hand and fingers; the pads are those of the twin's fingers."""
+
 # Links that may not touch. Neighbours always do, and so do their spheres.
 PAIRS = tuple((a, b) for a in range(8) for b in range(a + 2, 8))
 
@@ -83,16 +86,16 @@ def panda() -> RobotModel:
     return RobotModel(
         name="panda",
         joints=joints,
-        shapes=(*_arm_shapes(), *_hand_shapes(T_LINK_HAND)),
-        T_link_tcp=T_LINK_HAND @ _turned(0.0, _TCP),
+        shapes=(*_arm_shapes(), *hand_shapes(7, T_LINK_HAND)),
+        T_link_tcp=T_LINK_HAND @ _turned(0.0, HAND_TCP),
         home=np.array(_HOME),
         inertials=tuple(Inertial(m, c, _symmetric(i)) for m, c, i in _INERTIALS),
         gripper=GripperGeometry(
-            np.stack([T_LINK_HAND @ _turned(yaw, _FINGERS) for yaw in (0.0, np.pi)]),
+            np.stack([T_LINK_HAND @ _turned(yaw, FINGERS) for yaw in (0.0, np.pi)]),
             0.04,
-            (Capsule(0, (0.0, 0.0125, 0.0), (0.0, 0.0125, 0.0413), 0.0125),),
+            finger_shapes(),
             covering=body.on("finger", 0),
-            hand=_HAND,
+            hand=HAND,
         ),
         slack=body.slack,
         covering=joined(*arm_spheres(), body.on("hand", 7, T_LINK_HAND)),
@@ -132,10 +135,16 @@ def _arm_shapes() -> list[Capsule]:
     ]
 
 
-def _hand_shapes(T_link_hand: Array) -> list[Capsule]:
-    """Return a capsule in the body of the hand."""
-    start, end = (T_link_hand @ np.array([0.0, y, 0.04, 1.0]) for y in (-0.064, 0.064))
-    return [Capsule(7, (start[0], start[1], start[2]), (end[0], end[1], end[2]), 0.022)]
+def hand_shapes(link: int = 0, T_link_hand: Array | None = None) -> tuple[Capsule, ...]:
+    """Return a capsule in the body of the hand, which has the pose ``T_link_hand`` (4, 4) on a link."""
+    T = np.eye(4) if T_link_hand is None else T_link_hand
+    start, end = (T @ np.array([0.0, y, 0.04, 1.0]) for y in (-0.064, 0.064))
+    return (Capsule(link, (start[0], start[1], start[2]), (end[0], end[1], end[2]), 0.022),)
+
+
+def finger_shapes() -> tuple[Capsule, ...]:
+    """Return the capsule of one finger in its own frame."""
+    return (Capsule(0, (0.0, 0.0125, 0.0), (0.0, 0.0125, 0.0413), 0.0125),)
 
 
 def _dh(a: float, d: float, alpha: float) -> Array:

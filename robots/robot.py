@@ -14,7 +14,7 @@ from splatbot.geometry import inverse, transform_points
 from splatbot.protocols import Array, HandShape, KinematicChain, LinkSpheres
 from splatbot.robots.cover import cover
 from splatbot.robots.joints import Joint
-from splatbot.robots.shapes import Shape
+from splatbot.robots.shapes import Mesh, Shape
 
 
 @dataclass(frozen=True)
@@ -100,6 +100,7 @@ class RobotModel:
         allowed: pairs of links that may touch, in addition to neighbours and links whose spheres overlap at home.
         covering: spheres of the links. If None, they are generated from the shapes.
         pairs: (M, 2) links that may not touch. If None, they are derived from the spheres.
+        visual: visual meshes of links, for pictures alone.
 
     Raises:
         InputError: joints, home and shapes are inconsistent.
@@ -116,6 +117,7 @@ class RobotModel:
     allowed: tuple[tuple[int, int], ...] = ()
     covering: LinkSpheres | None = field(default=None, repr=False)
     pairs: NDArray[np.int32] | None = field(default=None, repr=False)
+    visual: tuple[Mesh, ...] = field(default=(), repr=False)
 
     def __post_init__(self) -> None:
         if len(self.home) != len(self.joints):

@@ -17,11 +17,12 @@ from splatbot.atomic import atomic_write
 from splatbot.errors import FormatError, InputError
 from splatbot.protocols import HandShape, LinkSpheres
 from splatbot.robots.arms import ARMS, arm_file
-from splatbot.robots.hands import attach, panda_2f85, panda_2f140
+from splatbot.robots.hands import attach, find_hand, panda_2f85, panda_2f140
 from splatbot.robots.joints import Joint
 from splatbot.robots.panda import panda
 from splatbot.robots.robot import GripperGeometry, Inertial, RobotModel
 from splatbot.robots.shapes import Capsule
+from splatbot.robots.visual import load_visual, save_visual
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,79}")
 _FORMAT = "splatbot robot 1"
@@ -46,7 +47,7 @@ def _shipped_arm(name: str) -> RobotModel:
 
 @cache
 def _with_hand(name: str, hand: str) -> RobotModel:
-    return attach(_shipped_arm(name), hand)
+    return attach(_shipped_arm(name), find_hand(hand))
 
 
 def robots_folder() -> Path:
@@ -98,7 +99,10 @@ def load_robot(name: str | Path) -> RobotModel:
 
 
 def save_robot(robot: RobotModel, path: Path) -> None:
-    """Write joints, spheres, gripper and other inputs of checks and planning; the shapes of links are not saved."""
+    """Write joints, spheres, gripper and other inputs of checks and planning; the shapes of links are not saved.
+
+    Visual meshes go to a file of the same name that ends in ``.npz``.
+    """
     spheres = robot.link_spheres
     document = {
         "format": _FORMAT,
@@ -123,6 +127,11 @@ def save_robot(robot: RobotModel, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(path) as file:
         file.write(json.dumps(document, indent=1).encode())
+    meshes = path.with_suffix(".npz")
+    if robot.visual:
+        save_visual(robot.visual, meshes)
+    else:
+        meshes.unlink(missing_ok=True)  # of a robot that was replaced
 
 
 def read_robot(path: Path) -> RobotModel:
@@ -131,6 +140,7 @@ def read_robot(path: Path) -> RobotModel:
     Raises:
         FormatError: the file is missing or damaged.
     """
+    meshes = path.with_suffix(".npz")
     try:
         d: dict[str, Any] = json.loads(path.read_text())
         if d["format"] != _FORMAT:
@@ -147,7 +157,10 @@ def read_robot(path: Path) -> RobotModel:
             covering=LinkSpheres(spheres[:, 0].astype(np.int32), np.ascontiguousarray(spheres[:, 1:4]), spheres[:, 4]),
             pairs=np.array(d["pairs"], dtype=np.int32).reshape(-1, 2),
             gripper=None if d.get("gripper") is None else _gripper(d["gripper"]),
+            visual=load_visual(meshes, len(d["joints"]) + 1) if meshes.is_file() else (),
         )
+    except FormatError:
+        raise
     except (OSError, ValueError, KeyError, TypeError, InputError) as error:
         raise FormatError(f"is no robot ({error}).", file=path, hint="add it again: splatbot robot add") from error
 

@@ -19,10 +19,17 @@ from splatbot.robots.reading import CONSTANTS, NamedShape, Reading, checked_slac
 from splatbot.robots.robot import Inertial, RobotModel
 from splatbot.robots.shapes import Box, Capsule, Shape
 
-_MOVING = ("revolute", "continuous", "prismatic")
+MOVING = ("revolute", "continuous", "prismatic")
+"""Types of joints that move."""
 
 
-def read_urdf(path: str | Path, *, tip: str | None = None, slack: float | None = None) -> Reading:
+GEOMETRY = ("collision", "visual")
+"""Kinds of geometry of a link."""
+
+
+def read_urdf(
+    path: str | Path, *, tip: str | None = None, slack: float | None = None, kinds: Sequence[str] = GEOMETRY
+) -> Reading:
     """Read the serial arm from the root to ``tip``.
 
     Fixed links belong to the link of the arm that carries them. Moving joints outside the arm (fingers) are fixed at
@@ -32,6 +39,7 @@ def read_urdf(path: str | Path, *, tip: str | None = None, slack: float | None =
         path: URDF file, or a xacro file if the package xacro is installed.
         tip: last link of the arm. If None, see :func:`splatbot.robots.reading.default_tip`.
         slack: see :class:`splatbot.robots.robot.RobotModel` [m]. If None, 2 % of the reach.
+        kinds: geometry that becomes shapes.
 
     Raises:
         FormatError: the file is no URDF, has no moving joint, or contains an invalid element, which the error names.
@@ -41,7 +49,7 @@ def read_urdf(path: str | Path, *, tip: str | None = None, slack: float | None =
     if root.tag != "robot":
         hint = "give a URDF, xacro or MJCF file, whose root is <robot> or <mujoco>"
         raise FormatError(f"its root is <{root.tag}>.", file=file, hint=hint)
-    return _UrdfReader(file, root, slack).read(tip)
+    return UrdfReader(file, root, slack, kinds).read(tip)
 
 
 def parse(file: Path) -> ElementTree.Element:
@@ -83,18 +91,29 @@ def _expanded(file: Path) -> ElementTree.Element:
         raise FormatError(f"cannot be expanded ({error}).", file=file, hint=hint) from error
 
 
-class _UrdfReader:
-    def __init__(self, file: Path, root: ElementTree.Element, slack: float | None) -> None:
-        self.file, self.root, self.slack = file, root, slack
-        self.links = {self._name(e): e for e in root.findall("link")}
-        self.joint_to = {self._link(e, "child"): e for e in root.findall("joint")}
+class UrdfReader:
+    """Links and joints of a URDF.
+
+    Args:
+        file: for errors, and for the paths of meshes.
+        root: element of the robot.
+        slack: see :class:`splatbot.robots.robot.RobotModel` [m].
+        kinds: geometry that becomes shapes.
+    """
+
+    def __init__(
+        self, file: Path, root: ElementTree.Element, slack: float | None = None, kinds: Sequence[str] = GEOMETRY
+    ) -> None:
+        self.file, self.root, self.slack, self.kinds = file, root, slack, kinds
+        self.links = {self.name(e): e for e in root.findall("link")}
+        self.joint_to = {self.link(e, "child"): e for e in root.findall("joint")}
         self.notes: list[str] = []
 
     def read(self, tip: str | None) -> Reading:
         if tip is not None and tip not in self.links:
             raise FormatError(f"there is no link {tip!r}.", file=self.file, hint=f"links: {', '.join(self.links)}")
         end = tip or self._default_tip()
-        arm = [e for e in self._path(end) if e.get("type") in _MOVING]
+        arm = [e for e in self._path(end) if e.get("type") in MOVING]
         if not arm:
             raise FormatError("has no moving joint.", file=self.file, field=end, hint="name another link with tip")
         joints: list[Joint] = []
@@ -104,21 +123,21 @@ class _UrdfReader:
         if len(placed) != 1:
             raise FormatError(f"has {len(placed)} root links.", file=self.file, hint="a URDF has one")
         left = dict(self.joint_to)
-        while ready := [child for child, joint in left.items() if self._link(joint, "parent") in placed]:
+        while ready := [child for child, joint in left.items() if self.link(joint, "parent") in placed]:
             for child in ready:
                 joint = left.pop(child)
-                k, T = placed[self._link(joint, "parent")]
-                T = T @ _origin(joint)
+                k, T = placed[self.link(joint, "parent")]
+                T = T @ origin(joint)
                 if joint not in arm:
                     placed[child] = (k, T @ self._fixed(joint))
                     continue
                 turn = np.eye(4)
-                turn[:3, :3] = z_to(self._axis(joint))
+                turn[:3, :3] = z_to(self.axis(joint))
                 joints.append(self._joint(joint, T @ turn))
                 placed[child] = (k + 1, turn.T)
         if left:
             raise FormatError("has links in a circle.", file=self.file, field=next(iter(left)), hint="a URDF is a tree")
-        shapes = distinct(shape for link, (k, T) in placed.items() for shape in self._shapes(link, k, T))
+        shapes = distinct(shape for link, (k, T) in placed.items() for shape in self.shapes(link, k, T))
         slack = checked_slack(shapes, joints, placed[end][1], self.slack, self.file)
         lower, upper = np.array([j.lower for j in joints]), np.array([j.upper for j in joints])
         robot = RobotModel(
@@ -136,21 +155,21 @@ class _UrdfReader:
         found: list[ElementTree.Element] = []
         while link in self.joint_to and len(found) <= len(self.joint_to):
             found.append(self.joint_to[link])
-            link = self._link(found[-1], "parent")
+            link = self.link(found[-1], "parent")
         return found[::-1]
 
     def _default_tip(self) -> str:
         carried: dict[str, list[str]] = {}
         for child, e in self.joint_to.items():
-            carried.setdefault(self._link(e, "parent"), []).append(child)
-        moving = [child for child, e in self.joint_to.items() if e.get("type") in _MOVING]
+            carried.setdefault(self.link(e, "parent"), []).append(child)
+        moving = [child for child, e in self.joint_to.items() if e.get("type") in MOVING]
         root = next((link for link in self.links if link not in self.joint_to), "")
         return default_tip(carried, moving, root, self.file)
 
     def _joint(self, e: ElementTree.Element, T: Array) -> Joint:
-        name, limit = self._name(e), e.find("limit")
-        values = {key: _number(limit.get(key)) if limit is not None else None for key in ("velocity", "effort")}
-        low, high = (_number(limit.get(key)) if limit is not None else None for key in ("lower", "upper"))
+        name, limit = self.name(e), e.find("limit")
+        values = {key: number(limit.get(key)) if limit is not None else None for key in ("velocity", "effort")}
+        low, high = (number(limit.get(key)) if limit is not None else None for key in ("lower", "upper"))
         if e.get("type") == "continuous":
             low, high = -2 * np.pi, 2 * np.pi
             self.notes.append(f"{name} turns without end: limited to two turns")
@@ -169,33 +188,34 @@ class _UrdfReader:
     def _fixed(self, e: ElementTree.Element) -> Array:
         """Return the transform (4, 4) of a joint outside the arm."""
         T = np.eye(4)
-        if e.get("type") not in _MOVING:
+        if e.get("type") not in MOVING:
             return T
         limit = e.find("limit")
-        low, high = (_number(limit.get(key)) if limit is not None else None for key in ("lower", "upper"))
+        low, high = (number(limit.get(key)) if limit is not None else None for key in ("lower", "upper"))
         at = float(np.clip(0.0, low if low is not None else -np.inf, high if high is not None else np.inf))
-        self.notes.append(f"{self._name(e)} is not on the arm: held at {at:g}")
+        self.notes.append(f"{self.name(e)} is not on the arm: held at {at:g}")
         if e.get("type") == "prismatic":
-            T[:3, 3] = at * self._axis(e)
+            T[:3, 3] = at * self.axis(e)
         else:
-            T[:3, :3] = so3_exp(at * self._axis(e))
+            T[:3, :3] = so3_exp(at * self.axis(e))
         return T
 
-    def _axis(self, e: ElementTree.Element) -> Array:
+    def axis(self, e: ElementTree.Element) -> Array:
+        """Return the unit axis (3,) of a joint in its own frame."""
         found = e.find("axis")
         axis = _vector(found.get("xyz") if found is not None else None, (1.0, 0.0, 0.0))
         if not np.linalg.norm(axis) > 0:
-            raise FormatError("has an axis of no length.", file=self.file, field=self._name(e), hint="give a direction")
+            raise FormatError("has an axis of no length.", file=self.file, field=self.name(e), hint="give a direction")
         return np.asarray(axis / np.linalg.norm(axis))
 
-    def _shapes(self, link: str, k: int, T: Array) -> list[NamedShape]:
+    def shapes(self, link: str, k: int, T: Array) -> list[NamedShape]:
         """Return the collision and the visual geometry of a link; the same geometry in both counts once."""
         found: dict[str, list[NamedShape]] = {}
-        for kind in ("collision", "visual"):
+        for kind in self.kinds:
             for e in self.links[link].findall(kind):
                 key = " ".join(str(part.attrib) for part in e.iter() if part.tag not in (kind, "material", "color"))
                 try:
-                    found.setdefault(key, self._shape(e, link, k, T @ _origin(e)))
+                    found.setdefault(key, self._shape(e, link, k, T @ origin(e)))
                 except FormatError as error:
                     if kind == "collision" or not self.links[link].findall("collision"):
                         raise
@@ -251,10 +271,10 @@ class _UrdfReader:
         parts: list[list[tuple[float, Array, Array]]] = [[] for _ in range(joints + 1)]
         for link, (k, T_link) in placed.items():
             e = self.links[link].find("inertial")
-            m = _number(e.find("mass").get("value")) if e is not None and e.find("mass") is not None else None  # type: ignore[union-attr]
+            m = number(e.find("mass").get("value")) if e is not None and e.find("mass") is not None else None  # type: ignore[union-attr]
             if e is None or not m:
                 continue
-            T, values = T_link @ _origin(e), e.find("inertia")
+            T, values = T_link @ origin(e), e.find("inertia")
             ixx, iyy, izz, ixy, ixz, iyz = (
                 float(values.get(key, "0")) if values is not None else 0.0
                 for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
@@ -267,24 +287,26 @@ class _UrdfReader:
         return tuple(Inertial.summed(own) for own in parts)
 
     def _size(self, e: ElementTree.Element, key: str, link: str) -> float:
-        value = _number(e.get(key))
+        value = number(e.get(key))
         if value is None or not value > 0:
             raise FormatError(
                 f"<{e.tag}> has {key} {e.get(key)!r}.", file=self.file, field=link, hint="give metres above 0"
             )
         return value
 
-    def _name(self, e: ElementTree.Element) -> str:
+    def name(self, e: ElementTree.Element) -> str:
+        """Return the name of an element."""
         name = e.get("name")
         if not name:
             raise FormatError(f"a <{e.tag}> has no name.", file=self.file, hint="name it")
         return name
 
-    def _link(self, joint: ElementTree.Element, end: str) -> str:
+    def link(self, joint: ElementTree.Element, end: str) -> str:
+        """Return the link at an end of a joint, which is "parent" or "child"."""
         e = joint.find(end)
         name = e.get("link") if e is not None else None
         if name is None or name not in self.links:
-            raise FormatError(f"its {end} is {name!r}.", file=self.file, field=self._name(joint), hint="name a link")
+            raise FormatError(f"its {end} is {name!r}.", file=self.file, field=self.name(joint), hint="name a link")
         return name
 
 
@@ -297,7 +319,7 @@ def _cylinder(k: int, T: Array, radius: float, length: float) -> Shape:
     return Capsule(k, (start[0], start[1], start[2]), (end[0], end[1], end[2]), radius)
 
 
-def _origin(e: ElementTree.Element) -> Array:
+def origin(e: ElementTree.Element) -> Array:
     """Return the pose (4, 4) of an element: fixed-axis roll, pitch, yaw."""
     found = e.find("origin")
     T = np.eye(4)
@@ -311,13 +333,14 @@ def _origin(e: ElementTree.Element) -> Array:
 def _vector(text: str | None, default: Sequence[float]) -> Array:
     if text is None:
         return np.asarray(default, dtype=np.float64)
-    values = [_number(word) for word in text.split()]
+    values = [number(word) for word in text.split()]
     if len(values) != 3 or any(v is None for v in values):
         raise FormatError(f"is {text!r}.", field="xyz, rpy, size or scale", hint="give three numbers")
     return np.array(values, dtype=np.float64)
 
 
-def _number(text: str | None) -> float | None:
+def number(text: str | None) -> float | None:
+    """Return a finite number, or None."""
     try:
         value = float(text) if text is not None else None
     except ValueError:

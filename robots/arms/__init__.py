@@ -21,7 +21,7 @@ class ShippedArm:
         home: (J,) posture without self-collision [rad].
         slack: largest distance of the spheres beyond the geometry [m].
         base_slack: the same of the base, which is checked against other links alone. If 0, it is ``slack``.
-        hands: of :data:`splatbot.robots.hands.HANDS` that it can carry.
+        hands: of :data:`splatbot.robots.hands.HAND_NAMES` that it can carry.
         efforts: (J,) largest torques [Nm] from the data sheet. If empty, the description has them.
         masses: description of the same arm with inertias. If None, they are in the first one.
     """
@@ -31,7 +31,7 @@ class ShippedArm:
     home: tuple[float, ...]
     slack: float
     base_slack: float = 0.0
-    hands: tuple[str, ...] = ("2f85", "2f140")
+    hands: tuple[str, ...] = ("2f85", "2f140", "panda_hand")
     efforts: tuple[float, ...] = ()
     masses: Source | None = None
 
@@ -56,6 +56,15 @@ ARMS = {
         home=(0.0, -1.57, 1.57, -1.57, -1.57, 0.0),
         slack=0.013,
         base_slack=0.03,
+    ),
+    "xarm6": ShippedArm(
+        _source(
+            "rtb-data", "armer_xarm/data/xacro/robots/xarm6", "xarm6.xacro", "xarm_ros by UFACTORY",
+            "BSD-3-Clause",
+        ),
+        tip="link_eef",
+        home=(0.0, -0.25, -0.8, 0.0, 1.05, 0.0),
+        slack=0.015,
     ),
     "xarm7": ShippedArm(
         _source(

@@ -12,7 +12,7 @@ from splatbot.robots.arms import ARMS, ShippedArm, description_of
 from splatbot.robots.bodies import joined, rounded
 from splatbot.robots.containment import uncovered
 from splatbot.robots.cover import FINE, cover
-from splatbot.robots.description import read_description
+from splatbot.robots.description import read_description, visual_of
 from splatbot.robots.maker_meshes import ReportProgress
 from splatbot.robots.robot import Inertial, RobotModel
 
@@ -51,7 +51,8 @@ def fit_arm(name: str, report_progress: ReportProgress) -> RobotModel:
     covering = LinkSpheres(fitted.link, *rounded(fitted.centers, fitted.radii))
     if uncovered(robot.shapes, covering) > 0:
         raise InputError("is not contained after rounding.", field=name, hint="fit with another slack")
-    return replace(robot, covering=covering, inertials=inertials)
+    visual = visual_of(description_of(arm.source), tip=arm.tip)
+    return replace(robot, covering=covering, inertials=inertials, visual=visual)
 
 
 def _inertials(arm: ShippedArm, robot: RobotModel) -> tuple[Inertial, ...]:

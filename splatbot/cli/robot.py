@@ -32,6 +32,7 @@ def robot(
     Examples:
         splatbot robot add ur5.urdf --tip tool0
         splatbot robot add ur5.urdf --tip tool0 --gripper 2f85
+        splatbot robot add ur5e --gripper my_gripper.urdf --name lab-ur5e
         splatbot robot add menagerie/ufactory_xarm7/xarm7.xml --name lab-xarm
         splatbot robot info panda
         splatbot robot info panda --check-meshes --out panda-body.png
@@ -40,14 +41,15 @@ def robot(
 
     Args:
         action: the action.
-        name: a robot's name; for add, the file.
+        name: a robot's name; for add, the file, or a shipped arm that gets a hand.
         out: the file to write; mjcf prints without one. info --check-meshes draws NAME-body.png by default, and fit
             writes NAME.json.
         tip: add: the link at the arm's end (MJCF: a body or site); by default the last one before fingers.
         slack: largest distance of the spheres beyond the geometry [m]; for fit panda 0.011 by default. By default add
             takes 2 % of the reach. It takes more if that needs too many spheres.
         rename: add: the name to store the arm under; by default that in the file.
-        gripper: add: attach a hand to the tool frame, whose z axis points outwards: 2f85 or 2f140.
+        gripper: add: attach a hand to the tool frame, whose z axis points outwards: 2f85, 2f140, panda_hand, or the
+            URDF of a gripper with two prismatic fingers.
         overwrite: add: replace a robot of that name.
         check_meshes: info: prove that the spheres contain the meshes of the maker, which a package must provide.
     """
@@ -159,27 +161,45 @@ def _add(
 ) -> int:
     from dataclasses import replace
 
+    from splatbot.cli.tables import print_text
     from splatbot.errors import InputError
+    from splatbot.robots.arms import ARMS
     from splatbot.robots.containment import uncovered
-    from splatbot.robots.description import read_description
-    from splatbot.robots.hands import attach, find_hand
+    from splatbot.robots.description import read_description, visual_of
+    from splatbot.robots.hand_reader import read_hand
+    from splatbot.robots.hands import Hand, attach, find_hand
     from splatbot.robots.reading import simplified
-    from splatbot.robots.store import robot_file, save_robot
+    from splatbot.robots.store import load_robot, robot_file, save_robot
 
-    if gripper is not None:
-        find_hand(gripper)  # an error before the work
-    reading = read_description(path, tip=tip, slack=slack)
-    suffix = "" if gripper is None else f"-{gripper}"
-    arm = replace(reading.robot, name=rename or f"{reading.robot.name}{suffix}")
-    for note in reading.notes:
-        print(f"note: {note}")
+    hand: Hand | None = None
+    notes: tuple[str, ...] = ()
+    if gripper is not None and Path(gripper).suffix in (".urdf", ".xacro"):
+        read = read_hand(gripper)
+        hand, notes = read.hand, read.notes
+    elif gripper is not None:
+        hand = find_hand(gripper)
+    stored = str(path) in ARMS and not path.exists()
+    if stored and hand is None:
+        raise InputError("is shipped.", field=str(path), hint="attach a hand with --gripper, or give a file")
+    if stored:
+        arm = load_robot(str(path))
+    else:
+        reading = read_description(path, tip=tip, slack=slack)
+        arm, notes = replace(reading.robot, visual=visual_of(path, tip=tip)), (*reading.notes, *notes)
+    suffix = "" if hand is None else f"-{hand.name}"
+    arm = replace(arm, name=rename or f"{arm.name}{suffix}")
+    for note in notes:
+        print_text(f"note: {note}")
     file = out if out is not None else robot_file(arm.name)
     if file.exists() and not overwrite:
         raise InputError("exists.", file=file, hint="give another --name, or replace it with --overwrite")
-    print(f"{arm.name}: {len(arm)} joints; fitting spheres within {1e3 * arm.slack:.0f} mm of its geometry ...")
-    arm = simplified(arm, slack is None)
-    if gripper is not None:
-        arm = replace(attach(arm, gripper), name=arm.name)
+    if not stored:
+        print_text(
+            f"{arm.name}: {len(arm)} joints; fitting spheres within {1e3 * arm.slack:.0f} mm of its geometry ..."
+        )
+        arm = simplified(arm, slack is None)
+    if hand is not None:
+        arm = replace(attach(arm, hand), name=arm.name)
     beyond = uncovered(arm.shapes, arm.spheres())
     save_robot(arm, file)
     inside = beyond <= 1e-9

@@ -12,10 +12,7 @@ from splatbot.geometry import look_at, transform_points
 from splatbot.protocols import Array
 from splatbot.report.robot_drawing import CONSTANTS, DrawnPart, draw_robot
 from splatbot.robots.appearance import appearance
-from splatbot.robots.hands import panda_2f85, panda_2f140
-from splatbot.robots.panda import panda
-from splatbot.robots.robot import RobotModel
-from splatbot.robots.store import load_robot
+from splatbot.robots.store import load_robot, robot_names
 
 CAMERA = Camera(150.0, 150.0, 79.5, 59.5, 160, 120)
 T_CAMERA = look_at(np.array([0.0, -1.0, 0.5]), np.zeros(3))
@@ -90,12 +87,13 @@ def test_links_move_by_their_poses() -> None:
     assert CONSTANTS.samples >= 2
 
 
-@pytest.mark.parametrize("robot", [panda(), panda_2f85(), panda_2f140()], ids=lambda r: r.name)
+@pytest.mark.parametrize("name", [name for name in robot_names() if "panda_hand" not in name or "ur5e" in name])
 @pytest.mark.parametrize("opening", [0.0, 0.03])
-def test_drawn_meshes_lie_in_the_certified_body(robot: RobotModel, opening: float) -> None:
-    spheres = robot.spheres(opening)
+def test_drawn_meshes_lie_in_the_certified_body(name: str, opening: float) -> None:
+    robot = load_robot(name)
+    spheres = robot.spheres(opening if robot.gripper else None)
     parts = appearance(robot, opening)
-    assert {part.link for part in parts} == set(range(8))
+    assert {part.link for part in parts} == set(spheres.link.tolist())
     T = robot.fk(robot.home)
     centers = np.einsum("sij,sj->si", T[spheres.link, :3, :3], spheres.centers) + T[spheres.link, :3, 3]
     for part in parts:
@@ -105,7 +103,7 @@ def test_drawn_meshes_lie_in_the_certified_body(robot: RobotModel, opening: floa
 
 
 def test_robots_without_shapes_show_their_spheres() -> None:
-    robot = load_robot("ur5e")
+    robot = replace(load_robot("ur5e"), visual=())
     spheres, parts = robot.spheres(), appearance(robot)
     assert len(parts) == len(spheres.radii)
     for part, center, radius in list(zip(parts, spheres.centers, spheres.radii, strict=True))[::40]:

@@ -8,12 +8,13 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from splatbot.errors import InputError
 from splatbot.geometry import inverse, transform_points
 from splatbot.protocols import HasHand
 from splatbot.robots.containment import uncovered
-from splatbot.robots.hands import HANDS, attach, panda_2f85, panda_2f140
+from splatbot.robots.hands import attach, find_hand, franka_hand, panda_2f85, panda_2f140
 from splatbot.robots.mjcf import to_mjcf
 from splatbot.robots.panda import panda
 from splatbot.robots.robot import Inertial, RobotModel
@@ -80,14 +81,14 @@ def test_its_spheres_cover_its_shapes_and_home_is_free_of_itself(robot: RobotMod
 @pytest.mark.parametrize("name", ["2f85", "2f140"])
 def test_a_hand_on_an_added_arm_is_stored_with_it(tmp_path: Path, name: str) -> None:
     arm = read_urdf(ur5(tmp_path), tip="tool0").robot
-    robot = attach(arm, name)
+    robot = attach(arm, find_hand(name))
     panda_with = load_robot(f"panda-{name}")
     assert robot.hand is not None
     assert panda_with.hand is not None
     assert astuple(robot.hand)[:6] == pytest.approx(astuple(panda_with.hand)[:6], abs=1e-9)
     assert robot.hand.palm_size == pytest.approx(panda_with.hand.palm_size, abs=1e-3)
     along = inverse(arm.T_link_tcp) @ robot.T_link_tcp
-    np.testing.assert_allclose(along[:3, 3], [0, 0, HANDS[name].tcp], atol=1e-12)
+    np.testing.assert_allclose(along, find_hand(name).T_flange_tcp, atol=1e-12)
     assert uncovered(robot.shapes, robot.spheres(0.0)) <= 0
     save_robot(robot, tmp_path / "arm.json")
     again = read_robot(tmp_path / "arm.json")
@@ -99,15 +100,34 @@ def test_a_hand_on_an_added_arm_is_stored_with_it(tmp_path: Path, name: str) -> 
         np.testing.assert_allclose(ours.radii, theirs.radii, atol=1e-12)
     np.testing.assert_array_equal(again.self_collision_pairs, robot.self_collision_pairs)
     with pytest.raises(InputError, match=r"ur5-2f.*: has a gripper"):
-        attach(robot, name)
-    with pytest.raises(InputError, match=r"gripper: is 'claw'.*grippers: 2f85, 2f140"):
-        attach(arm, "claw")
+        attach(robot, find_hand(name))
+
+
+def test_a_hand_that_is_not_known_is_refused_with_the_names_of_those_that_are() -> None:
+    with pytest.raises(InputError, match=r"gripper: is 'claw'.*grippers: 2f85, 2f140, panda_hand"):
+        find_hand("claw")
+
+
+def test_frankas_hand_on_another_arm_is_that_of_the_panda(tmp_path: Path) -> None:
+    robot, own = attach(read_urdf(ur5(tmp_path), tip="tool0").robot, franka_hand()), panda()
+    assert robot.hand == own.hand
+    for opening in (0.0, 0.05, None):
+        ours, theirs = (_on_the_tool(arm, opening) for arm in (robot, own))
+        hand = ours[len(ours) - 2 * len(own.finger_spheres) :]
+        np.testing.assert_allclose(hand, theirs[len(theirs) - len(hand) :], atol=1e-9)
+
+
+def _on_the_tool(robot: RobotModel, opening: float | None) -> NDArray[np.float64]:
+    """Return the spheres (S, 4) of the last link in the frame of the tool [m]."""
+    spheres = robot.spheres(opening)
+    own = spheres.link == len(robot)
+    return np.c_[transform_points(inverse(robot.T_link_tcp), spheres.centers[own]), spheres.radii[own]]
 
 
 def test_the_mass_of_a_hand_counts_in_the_twin(tmp_path: Path) -> None:
     inertials = tuple(Inertial(2.0, (0.0, 0.0, 0.05), 0.01 * np.eye(3)) for _ in range(7))
     arm = replace(read_urdf(ur5(tmp_path), tip="tool0").robot, inertials=inertials)
-    robot = attach(arm, "2f85")
+    robot = attach(arm, find_hand("2f85"))
     assert robot.inertials[-1].mass == pytest.approx(2.925)
     model = mujoco.MjModel.from_xml_string(to_mjcf(robot))
     data = mujoco.MjData(model)
