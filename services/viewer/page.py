@@ -41,9 +41,10 @@ def map_page(
         if trajectory is not None:
             scene.show_camera_path(trajectory)
         if workspace is not None and workspace.T_world_base is not None:
-            arm = RobotSpheres(load_robot(robot), T_world_base=workspace.T_world_base)
-            q = plan.start if plan is not None else np.asarray(load_robot(robot).home)
-            scene.show_robot(arm, q, GaussianCollisionField(model))
+            known = load_robot(robot)
+            arm = RobotSpheres(known, T_world_base=workspace.T_world_base)
+            q = plan.start if plan is not None else np.asarray(known.home)
+            scene.show_robot(arm, known, q, GaussianCollisionField(model))
             if plan is not None:
                 scene.show_plan(arm, plan)
         return scene.html()

@@ -6,7 +6,7 @@ import contextlib
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 import trimesh
@@ -22,6 +22,9 @@ from splatbot.grasping.types import Grasp
 from splatbot.planning import JointTrajectory
 from splatbot.protocols import Array
 from splatbot.rasterize.views import default_view
+from splatbot.report.robot_drawing import DrawnPart
+from splatbot.robots.appearance import appearance
+from splatbot.robots.robot import RobotModel
 from splatbot.services.viewer.door import Check, guarded, no_connection
 from splatbot.services.viewer.splats import Coloring, pieces
 from splatbot.trajectory import Trajectory
@@ -37,6 +40,7 @@ class ViewerSceneConstants:
         frustum_line: [px] width of its lines.
         full_clearance: [m] an arm with at least this clearance is green.
         path_points: points of a shown path.
+        mark: [m] radius of a measured point.
     """
 
     max_frusta: int = 60
@@ -44,12 +48,18 @@ class ViewerSceneConstants:
     frustum_line: float = 1.5
     full_clearance: float = 0.1
     path_points: int = 60
+    mark: float = 0.004
 
 
 CONSTANTS = ViewerSceneConstants()
 
 
+Posture = Literal["now", "plan"]
+RobotDisplay = Literal["meshes", "certified spheres", "both", "hidden"]
+ROBOT_DISPLAYS: tuple[RobotDisplay, ...] = get_args(RobotDisplay)
+
 _GREY, _BLUE, _AMBER = (150, 150, 150), (40, 120, 255), (255, 170, 0)
+_PLAN_OPACITY = 0.5
 
 
 def open_server(host: str, port: int, check: Check = no_connection) -> viser.ViserServer:
@@ -89,6 +99,8 @@ class ViewerScene:
         server.scene.set_up_direction(tuple(self._up.tolist()))
         self._drawn: dict[tuple[int, int, int], tuple[bytes, Any]] = {}
         self._balls: dict[str, Any] = {}
+        self._meshes: dict[str, list[tuple[int, Any]]] = {}
+        self._display: RobotDisplay = "meshes"
         self._unit = trimesh.creation.icosphere(subdivisions=2)
 
     def look(self, position: Array, target: Array, *, fov_deg: float = 50.0) -> None:
@@ -141,13 +153,24 @@ class ViewerScene:
         """Show the present pose of the camera."""
         self._frustum("/camera/now", T_world_camera, camera, _BLUE)
 
-    def show_robot(self, arm: RobotSpheres, q: Array, field: GaussianCollisionField | None, name: str = "now") -> None:
-        """Show the robot's spheres at joints ``q`` (J,), red in collision, green from 10 cm of clearance."""
+    def show_robot(
+        self,
+        arm: RobotSpheres,
+        robot: RobotModel,
+        q: Array,
+        field: GaussianCollisionField | None,
+        name: Posture = "now",
+    ) -> None:
+        """Show the robot at joints ``q`` (J,): its meshes, and its certified spheres coloured by clearance.
+
+        The spheres are red in collision, and green from 10 cm of clearance. :meth:`display_robot` hides either layer.
+        """
+        self._show_meshes(robot, arm.T_world_base @ robot.fk(q), name)
         centers = arm.centers(q[None])[0]
         rgb = clearance_colors(field, centers, arm.spheres.radii)
         if name not in self._balls:
             self._balls[name] = self._server.scene.add_batched_meshes_simple(
-                f"/robot/{name}",
+                f"/robot/{name}/spheres",
                 np.asarray(self._unit.vertices, np.float32),
                 np.asarray(self._unit.faces, np.uint32),
                 batched_wxyzs=np.tile([1.0, 0, 0, 0], (len(centers), 1)).astype(np.float32),
@@ -155,11 +178,55 @@ class ViewerScene:
                 batched_scales=arm.spheres.radii.astype(np.float32),
                 batched_colors=rgb,
                 lod="off",
-                opacity=0.5 if name == "plan" else None,
+                opacity=_PLAN_OPACITY if name == "plan" else None,
             )
-            return
-        handle = self._balls[name]
-        handle.batched_positions, handle.batched_colors = centers.astype(np.float32), rgb
+        else:
+            handle = self._balls[name]
+            handle.batched_positions, handle.batched_colors = centers.astype(np.float32), rgb
+        self.display_robot(self._display)
+
+    def display_robot(self, display: RobotDisplay) -> None:
+        """Choose the layers of the robot that are visible."""
+        self._display = display
+        for handle in self._balls.values():
+            handle.visible = display in ("certified spheres", "both")
+        for meshes in self._meshes.values():
+            for _, handle in meshes:
+                handle.visible = display in ("meshes", "both")
+
+    def _show_meshes(self, robot: RobotModel, T_world_link: Array, name: Posture) -> None:
+        """Draw the appearance of the robot once, and move its links to ``T_world_link`` (L, 4, 4)."""
+        if name not in self._meshes:
+            self._meshes[name] = [
+                (part.link, self._part(f"/robot/{name}/meshes/{k}", part, _PLAN_OPACITY if name == "plan" else None))
+                for k, part in enumerate(merged(appearance(robot)))
+            ]
+        for link, handle in self._meshes[name]:
+            handle.wxyz, handle.position = rotation_to_quat(T_world_link[link, :3, :3]), T_world_link[link, :3, 3]
+
+    def _part(self, name: str, part: DrawnPart, opacity: float | None) -> Any:
+        corners = part.triangles.reshape(-1, 3)
+        return self._server.scene.add_mesh_simple(
+            name,
+            corners.astype(np.float32),
+            np.arange(len(corners), dtype=np.uint32).reshape(-1, 3),
+            color=part.color,
+            flat_shading=True,
+            side="double",
+            opacity=opacity,
+        )
+
+    def show_distance(self, points: Sequence[Array]) -> None:
+        """Mark the points (3,) [m] that were clicked, at most two, and the distance between two of them."""
+        for name in ("/measure/line", "/measure/label", "/measure/0", "/measure/1"):
+            self._server.scene.remove_by_name(name)
+        for k, point in enumerate(points):
+            self._server.scene.add_icosphere(f"/measure/{k}", CONSTANTS.mark, _AMBER, position=point)
+        if len(points) == 2:
+            line = np.stack(points)[None].astype(np.float32)
+            self._server.scene.add_line_segments("/measure/line", line, _AMBER, thickness=0.002)
+            text = f"{1e3 * np.linalg.norm(points[1] - points[0]):.0f} mm"
+            self._server.scene.add_label("/measure/label", text, position=(points[0] + points[1]) / 2)
 
     def show_plan(self, arm: RobotSpheres, plan: JointTrajectory) -> None:
         """Show the tool's path along a planned motion."""
@@ -198,6 +265,17 @@ class ViewerScene:
             wxyz=rotation_to_quat(T[:3, :3]),
             position=T[:3, 3],
         )
+
+
+def merged(parts: Sequence[DrawnPart]) -> list[DrawnPart]:
+    """Join the parts of a link that have the same colour."""
+    groups: dict[tuple[int, tuple[float, ...]], list[Array]] = {}
+    for part in parts:
+        groups.setdefault((part.link, tuple(part.color)), []).append(part.triangles)
+    return [
+        DrawnPart(link, np.concatenate(triangles), (color[0], color[1], color[2]))
+        for (link, color), triangles in groups.items()
+    ]
 
 
 def clearance_colors(

@@ -9,13 +9,16 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch
 
 from splatbot.camera import Camera
 from splatbot.collision import RobotSpheres
 from splatbot.frame import Frame
+from splatbot.gaussians import GaussianModel
 from splatbot.grasping.types import GraspResult
 from splatbot.planning import JointTrajectory
 from splatbot.protocols import Array
+from splatbot.robots.robot import RobotModel
 from splatbot.services.access import Access
 from splatbot.services.arms import known_robot
 from splatbot.services.bus import Message
@@ -23,7 +26,8 @@ from splatbot.services.store import MapStore, ServedMap
 from splatbot.services.threads import join_started
 from splatbot.services.topics import FRAME, GRASPS, PLAN, RESULT, STATE, TRAJECTORY, JointState
 from splatbot.services.viewer.door import Door
-from splatbot.services.viewer.scene import ViewerScene, close_server, open_server
+from splatbot.services.viewer.measuring import surface_point
+from splatbot.services.viewer.scene import ROBOT_DISPLAYS, ViewerScene, close_server, open_server
 from splatbot.services.viewer.splats import COLORINGS, Coloring
 from splatbot.slam import FrameResult
 from splatbot.trajectory import Trajectory
@@ -36,10 +40,14 @@ class ViewerConstants:
     Args:
         period: [s] time between two updates.
         max_waiting: largest number of messages that wait.
+        least_crop: [m] least distance of the crop.
+        no_crop: [m] distance from which everything is shown.
     """
 
     period: float = 0.5
     max_waiting: int = 256
+    least_crop: float = 0.2
+    no_crop: float = 5.0
 
 
 CONSTANTS = ViewerConstants()
@@ -93,6 +101,8 @@ class Viewer:
         self._served: ServedMap | None = None
         self._pose: Array | None = None
         self._arm: RobotSpheres | None = None
+        self._robot: RobotModel | None = None
+        self._clicked: list[Array] = []
         self._plan: JointTrajectory | None = None
         self._camera: Camera | None = None
         self._coloring: Coloring = "rgb"
@@ -124,6 +134,16 @@ class Viewer:
         gui = self.server.gui
         self._state = gui.add_markdown("waiting for a map")
         coloring = gui.add_dropdown("colours", COLORINGS, initial_value="rgb")
+        display = gui.add_dropdown("robot", ROBOT_DISPLAYS, initial_value="meshes")
+        self._crop = gui.add_slider(
+            "crop, m",
+            CONSTANTS.least_crop,
+            CONSTANTS.no_crop,
+            0.1,
+            CONSTANTS.no_crop,
+            hint=f"distance from the base, or from the middle of the map; {CONSTANTS.no_crop:g} shows all",
+        )
+        self._measure = gui.add_checkbox("measure", False, hint="click two points of the map")
         self._slider = gui.add_slider("planned motion", 0.0, 1.0, 0.01, 0.0, disabled=True)
         self._timings = gui.add_markdown("")
 
@@ -131,9 +151,48 @@ class Viewer:
         def _(_: Any) -> None:
             self._coloring, self._stale = coloring.value, True
 
+        @display.on_update
+        def _(_: Any) -> None:
+            self._scene.display_robot(display.value)
+
+        @self._crop.on_update
+        def _(_: Any) -> None:
+            self._stale = True
+
+        @self._measure.on_update
+        def _(_: Any) -> None:
+            self._clicked = []
+            self._scene.show_distance(self._clicked)
+
+        @self.server.scene.on_click()
+        def _(event: Any) -> None:
+            if self._measure.value:
+                self._take_click(np.asarray(event.ray_origin), np.asarray(event.ray_direction))
+
         @self._slider.on_update
         def _(_: Any) -> None:
             self._show_plan_at(self._slider.value)
+
+    def _take_click(self, origin: Array, direction: Array) -> None:
+        """Keep the point of the shown map that a click means; a third click begins again."""
+        shown = self._shown()
+        point = surface_point(shown, origin, direction) if shown is not None else None
+        if point is not None:
+            self._clicked = [*self._clicked, point] if len(self._clicked) < 2 else [point]
+            self._scene.show_distance(self._clicked)
+
+    def _shown(self) -> GaussianModel | None:
+        """Return the Gaussians within the crop, or None without a map."""
+        served = self._served
+        if served is None or served.snapshot is None:
+            return None
+        model, radius = served.snapshot.model, self._crop.value
+        if radius >= CONSTANTS.no_crop or not len(model):
+            return model
+        middle = model.means.median(dim=0).values
+        if self._arm is not None:
+            middle = torch.from_numpy(self._arm.T_world_base[:3, 3]).to(model.means)
+        return model.select((model.means - middle).norm(dim=1) <= radius)
 
     def _collect(self) -> None:
         """Keep the latest of each kind; values that arrive faster than they are drawn are skipped."""
@@ -183,7 +242,9 @@ class Viewer:
         served = self._served
         if served is not None and served.snapshot is not None and (news.served is not None or self._stale):
             self._stale = False
-            self._scene.show_map(served.snapshot.model, self._coloring, T_world_camera=self._pose)
+            shown = self._shown()
+            assert shown is not None
+            self._scene.show_map(shown, self._coloring, T_world_camera=self._pose)
         if news.trajectory is not None:
             self._scene.show_camera_path(news.trajectory, self._camera)
         if news.plan is not None and self._arm is not None:
@@ -193,8 +254,8 @@ class Viewer:
             self._show_plan_at(self._slider.value)
         if news.grasps is not None:
             self._scene.show_grasps(news.grasps.grasps)
-        if news.joints is not None and self._arm is not None and served is not None:
-            self._scene.show_robot(self._arm, news.joints.position, served.field)
+        if news.joints is not None and self._arm is not None and self._robot is not None and served is not None:
+            self._scene.show_robot(self._arm, self._robot, news.joints.position, served.field)
 
     def _take_map(self, served: ServedMap) -> None:
         first = self._served is None or self._served.snapshot is None
@@ -208,9 +269,9 @@ class Viewer:
             self._scene.show_camera_path(served.trajectory, self._camera)
         base = served.workspace.T_world_base if served.workspace is not None else None
         if base is not None and self._arm is None:
-            robot = known_robot(self._robot_name)
-            self._arm = RobotSpheres(robot, T_world_base=base)
-            self._scene.show_robot(self._arm, np.asarray(robot.home), served.field)
+            self._robot = known_robot(self._robot_name)
+            self._arm = RobotSpheres(self._robot, T_world_base=base)
+            self._scene.show_robot(self._arm, self._robot, np.asarray(self._robot.home), served.field)
 
     def _show_result(self, result: FrameResult) -> None:
         if result.T_world_camera is not None:
@@ -220,7 +281,7 @@ class Viewer:
         self._timings.content = f"frame {result.index}: {result.verdict}\n\n| stage | ms |\n|---|---|\n{rows}"
 
     def _show_plan_at(self, share: float) -> None:
-        arm, plan, served = self._arm, self._plan, self._served
-        if arm is not None and plan is not None and served is not None:
+        arm, robot, plan, served = self._arm, self._robot, self._plan, self._served
+        if arm is not None and robot is not None and plan is not None and served is not None:
             q = plan.at(share * plan.duration).position
-            self._scene.show_robot(arm, np.asarray(q), served.field, "plan")
+            self._scene.show_robot(arm, robot, np.asarray(q), served.field, "plan")

@@ -93,6 +93,11 @@ class Chromium:
         assert "exceptionDetails" not in told, told["exceptionDetails"]
         return told["result"].get("value")
 
+    def click(self, x: int, y: int) -> None:
+        """Press and release the left button at a pixel."""
+        for kind in ("mouseMoved", "mousePressed", "mouseReleased"):
+            self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
+
     def screenshot(self) -> NDArray[np.uint8]:
         """Capture the page as RGB (H, W, 3)."""
         data = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])

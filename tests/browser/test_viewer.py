@@ -108,7 +108,12 @@ def test_the_viewer_draws_the_splats_as_the_rasterizer_does_and_the_robot_and_it
         for point in (left, right):
             u, v = _pixel(point)
             np.testing.assert_allclose(_colour(image, point) / 255, expected[v, u], atol=0.06)
-        hand = arm.centers(home[None])[0][int(np.argmax(arm.spheres.radii))]
+        largest = int(np.argmax(arm.spheres.radii))
+        hand = arm.centers(home[None])[0][largest]
+        light = _colour(image, hand)
+        assert np.ptp(light) < 40  # a mesh, white or grey
+        viewer._scene.display_robot("certified spheres")
+        image = _shot(browser, hand, np.array([26.0, 220, 26]))
         assert GaussianCollisionField(model).clearance(hand[None]).distance[0] > 0.1
         red, green, blue = _colour(image, hand)
         assert green > 1.3 * max(red, blue)  # much room: green
@@ -121,6 +126,41 @@ def test_the_viewer_draws_the_splats_as_the_rasterizer_does_and_the_robot_and_it
         near = image[v - 8 : v + 9, u - 8 : u + 9].reshape(-1, 3).astype(int)
         amber = (near[:, 0] > 180) & (near[:, 1] > 100) & (near[:, 2] < 120)
         assert amber.any()
+    finally:
+        viewer.stop()
+
+
+def test_two_clicks_measure_a_distance_and_the_crop_leaves_the_robot_alone(browser: Chromium) -> None:
+    store, model = MapStore(), _wall()
+    store.add("desk", source="a", state="mapping", snapshot=Snapshot(model, 1), workspace=Workspace(T_world_base=BASE))
+    viewer = Viewer(store, Access(ServiceSettings()), port=0)
+    viewer._scene._up = np.array([0.0, 0.0, 1.0])
+    viewer.server.scene.set_up_direction("+z")
+    viewer.start()
+    try:
+        time.sleep(1.5)
+        viewer._scene.look(EYE, TARGET, fov_deg=FOV)
+        browser.open(f"http://127.0.0.1:{viewer.port}/?key={read_key(key_file())}")
+        ends = np.array([-0.6, -0.7, 0.2]), np.array([-0.6, -0.7, 0.9])
+        _shot(browser, ends[0], np.array([230.0, 26, 26]))
+        viewer._measure.value = True
+        for count, end in enumerate(ends, 1):
+            browser.click(*_pixel(end))
+            for _ in range(30):
+                time.sleep(0.5)
+                if len(viewer._clicked) == count:
+                    break
+            assert len(viewer._clicked) == count
+        assert np.linalg.norm(viewer._clicked[1] - viewer._clicked[0]) == pytest.approx(0.7, abs=0.02)
+        for _ in range(20):
+            time.sleep(0.3)
+            if " mm" in (text := browser.evaluate("document.body.innerText")):
+                break
+        assert f"{1e3 * np.linalg.norm(viewer._clicked[1] - viewer._clicked[0]):.0f} mm" in text
+        viewer._crop.value = 0.5  # the wall is 0.6 m from the base
+        viewer._stale = True
+        gone = _shot(browser, ends[0], np.array([255.0, 255, 255]))
+        assert np.abs(_colour(gone, ends[0]) - 255).max() < 60
     finally:
         viewer.stop()
 
