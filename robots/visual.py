@@ -22,7 +22,7 @@ _CELL = 0.004  # [m] within which corners become one
 
 
 def simplify(vertices: Array, faces: NDArray[np.integer], most: int) -> o3d.geometry.TriangleMesh:
-    """Simplify a mesh to at most ``most`` triangles by quadric decimation (Garland and Heckbert 1997).
+    """Reduce a mesh to at most ``most`` triangles by quadric decimation (Garland and Heckbert 1997).
 
     Args:
         vertices: (V, 3) [m].

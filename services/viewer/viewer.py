@@ -144,6 +144,7 @@ class Viewer:
             hint=f"distance from the base, or from the middle of the map; {CONSTANTS.no_crop:g} shows all",
         )
         self._measure = gui.add_checkbox("measure", False, hint="click two points of the map")
+        self._distance = gui.add_markdown("")
         self._slider = gui.add_slider("planned motion", 0.0, 1.0, 0.01, 0.0, disabled=True)
         self._timings = gui.add_markdown("")
 
@@ -161,8 +162,7 @@ class Viewer:
 
         @self._measure.on_update
         def _(_: Any) -> None:
-            self._clicked = []
-            self._scene.show_distance(self._clicked)
+            self._show_clicked([])
 
         @self.server.scene.on_click()
         def _(event: Any) -> None:
@@ -178,8 +178,11 @@ class Viewer:
         shown = self._shown()
         point = surface_point(shown, origin, direction) if shown is not None else None
         if point is not None:
-            self._clicked = [*self._clicked, point] if len(self._clicked) < 2 else [point]
-            self._scene.show_distance(self._clicked)
+            self._show_clicked([*self._clicked, point] if len(self._clicked) < 2 else [point])
+
+    def _show_clicked(self, points: list[Array]) -> None:
+        self._clicked = points
+        self._distance.content = self._scene.show_distance(points)
 
     def _shown(self) -> GaussianModel | None:
         """Return the Gaussians within the crop, or None without a map."""

@@ -48,8 +48,8 @@ def robot(
         slack: largest distance of the spheres beyond the geometry [m]; for fit panda 0.011 by default. By default add
             takes 2 % of the reach. It takes more if that needs too many spheres.
         rename: add: the name to store the arm under; by default that in the file.
-        gripper: add: attach a hand to the tool frame, whose z axis points outwards: 2f85, 2f140, panda_hand, or the
-            URDF of a gripper with two prismatic fingers.
+        gripper: add: attach a hand to the tool frame, whose z axis points outwards. It is 2f85, 2f140, panda_hand, or
+            the URDF of two prismatic fingers.
         overwrite: add: replace a robot of that name.
         check_meshes: info: prove that the spheres contain the meshes of the maker, which a package must provide.
     """
