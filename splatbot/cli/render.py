@@ -15,6 +15,12 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from splatbot.camera import Camera
+    from splatbot.gaussians import GaussianModel
+    from splatbot.rasterize.views import Mode
+
+_LONGEST_VIDEO_S = 600.0
+
 Pose = tuple[float, float, float, float, float, float, float]
 
 
@@ -28,16 +34,20 @@ def render(
     index: Annotated[int | None, tyro.conf.arg(metavar="I")] = None,
     size: Annotated[str, tyro.conf.arg(metavar="WxH")] = "640x480",
     fov: Annotated[float, tyro.conf.arg(metavar="DEG")] = 60.0,
+    video: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
+    seconds: Annotated[float, tyro.conf.arg(metavar="S")] = 8.0,
 ) -> int:
-    """Render a view of a map to a PNG.
+    """Render a view of a map to a PNG, or a fly-through to a video.
 
-    Without a pose the camera backs off until it sees most of the map. Depth runs from red (near) to blue (far).
+    Without a pose the camera backs off until it sees most of the map. Depth runs from red (near) to blue (far). A
+    fly-through follows the smoothed path of the recording camera.
 
     Examples:
         splatbot render runs/latest
         splatbot render map.ply --mode depth --out depth.png --size 1280x720
         splatbot render map.ply --pose 0 0 -1.5 1 0 0 0
         splatbot render runs/latest --index 30 --mode normal
+        splatbot render runs/latest --video fly.mp4 --seconds 10
 
     Args:
         map_: a map file, or a run folder.
@@ -48,19 +58,28 @@ def render(
         index: which pose of the trajectory, from 0; -1 is the last.
         size: width and height of the image [px].
         fov: horizontal field of view [deg].
+        video: MP4 of a fly-through, instead of a PNG; a map file needs --trajectory.
+        seconds: length of the video [s].
     """
     width, height = _parse_size(size)
-    file, path = map_file(map_), trajectory or _own_trajectory(map_, index)
+    file, path = map_file(map_), trajectory or _own_trajectory(map_, index, video)
     check_file(trajectory, "--trajectory")
     check_output(out, folder=False)
+    check_output(video, folder=False)
+    if video is not None:
+        _check_video(path, seconds, pose=pose, index=index, out=out)
 
     from splatbot.atomic import atomic_write
     from splatbot.gaussians import GaussianModel
     from splatbot.rasterize.views import default_view, render_view, to_png
 
-    given = _given_pose(pose, path, index)
+    given = _given_pose(pose, path, index) if video is None else None
     model = GaussianModel.load(file)
     camera, T_world_camera = default_view(model, width=width, height=height, fov_deg=fov)
+    if video is not None:
+        assert path is not None
+        _fly(model, camera, path, video, mode, seconds)
+        return 0
     view = render_view(model, camera, T_world_camera if given is None else given, mode)
     target = out if out is not None else Path(f"{map_.resolve().name if map_.is_dir() else map_.stem}-{mode}.png")
     with atomic_write(target) as image:
@@ -69,8 +88,43 @@ def render(
     return 0
 
 
-def _own_trajectory(path: Path, index: int | None) -> Path | None:
-    return path / "trajectory.tum" if path.is_dir() and index is not None else None
+def _own_trajectory(path: Path, index: int | None, video: Path | None) -> Path | None:
+    return path / "trajectory.tum" if path.is_dir() and (index is not None or video is not None) else None
+
+
+def _check_video(path: Path | None, seconds: float, *, pose: Pose | None, index: int | None, out: Path | None) -> None:
+    """Refuse a video without a path, or with options of a single view.
+
+    Raises:
+        InputError: an option does not fit.
+    """
+    from splatbot.errors import InputError
+
+    for name, value in (("--pose", pose), ("--index", index), ("--out", out)):
+        if value is not None:
+            raise InputError("is for a single view.", field=name, hint="leave it out, or leave --video out")
+    if path is None:
+        raise InputError("needs a camera path.", field="--video", hint="give a run folder, or --trajectory FILE")
+    if not 0.1 <= seconds <= _LONGEST_VIDEO_S:
+        raise InputError(f"is {seconds:g}.", field="--seconds", hint=f"give 0.1 to {_LONGEST_VIDEO_S:g}")
+
+
+def _fly(model: GaussianModel, camera: Camera, path: Path, video: Path, mode: Mode, seconds: float) -> None:
+    import sys
+
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from splatbot.rasterize.fly_through import CONSTANTS, smooth_path, write_fly_through
+    from splatbot.trajectory import Trajectory
+
+    poses = smooth_path(Trajectory.load(path), max(2, round(CONSTANTS.fps * seconds)))
+    with Progress(console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as bars:
+        task = bars.add_task("rendering", total=len(poses))
+        write_fly_through(
+            model, camera, poses, video, mode, report_progress=lambda done, _: bars.update(task, completed=done)
+        )
+    print(video)
 
 
 def _parse_size(text: str) -> tuple[int, int]:

@@ -105,11 +105,33 @@ def test_render_takes_a_pose_by_hand_or_by_index(run: RunCommand, run_folder: Pa
         (["--fov", "200"], "fov"),
         (["--index", "99"], "--index"),
         (["--pose", "0", "0", "0", "0", "0", "0", "0"], "--pose"),
+        (["--video", "a.mp4", "--index", "1"], "--index"),
+        (["--video", "a.mp4", "--seconds", "1e9"], "--seconds"),
+        (["--video", "a.mp4", "--seconds", "nan"], "--seconds"),
         (["--pose", "0", "0", "0", "1", "0", "0", "0", "--index", "1"], "--pose"),
     ],
 )
 def test_render_refuses_what_it_cannot_draw(run: RunCommand, run_folder: Path, words: list[str], field: str) -> None:
     assert_fix_named(run("render", run_folder, *words), field)
+
+
+@pytest.mark.parametrize("mode", ["rgb", "depth", "alpha"])
+def test_render_writes_a_fly_through_of_the_given_length(
+    run: RunCommand, run_folder: Path, tmp_path: Path, mode: str
+) -> None:
+    words = ["--video", tmp_path / "fly.mp4", "--seconds", "0.4", "--size", "80x60", "--mode", mode]
+    assert run("render", run_folder, *words).code == 0
+    video = cv2.VideoCapture(str(tmp_path / "fly.mp4"))
+    frames = []
+    while (read := video.read())[0]:
+        frames.append(read[1])
+    assert len(frames) == 10
+    assert frames[0].shape == (60, 80, 3)
+    assert all(frame.max() > 50 for frame in frames)
+
+
+def test_a_fly_through_of_a_map_file_needs_a_trajectory(run: RunCommand, run_folder: Path, tmp_path: Path) -> None:
+    assert_fix_named(run("render", run_folder / "map.ply", "--video", tmp_path / "a.mp4"), "--video")
 
 
 @pytest.mark.parametrize("command", ["render", "info"])
