@@ -59,6 +59,10 @@ check: $(INSTALL_STAMP) ## ruff, mypy, layering contract, prose, and the native 
 	  -DPython_EXECUTABLE=$(CURDIR)/$(BIN)/python -DSPLATBOT_WERROR=ON
 	$(BIN)/cmake --build build/werror
 
+.PHONY: figures
+figures: $(INSTALL_STAMP) ## run the commands behind the figures of the documentation, and compare (minutes; needs the test data)
+	$(BIN)/python -m tests.figures
+
 .PHONY: clean
 clean: ## remove the virtual environment, build products and caches; runs/ is kept
 	rm -rf $(VENV) build dist .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis *.egg-info
