@@ -56,12 +56,15 @@ class AuditedError:
         """Return the number of points."""
         return len(self.error)
 
-    def near(self, centers: ArrayLike, distance: float) -> AuditedError:
-        """Return the points within ``distance`` [m] of any of the ``centers`` (C, 3) [m, world]."""
-        gap, _ = cKDTree(np.asarray(centers, dtype=np.float64).reshape(-1, 3)).query(
-            self.points, distance_upper_bound=distance
-        )
-        inside = np.isfinite(gap)
+    def near(self, centers: ArrayLike, distance: float, least: int = 0) -> AuditedError:
+        """Return the points within ``distance`` [m] of any of the ``centers`` (C, 3) [m, world].
+
+        If fewer than ``least`` points are there, the nearest ``least`` points are returned.
+        """
+        gap, _ = cKDTree(np.asarray(centers, dtype=np.float64).reshape(-1, 3)).query(self.points)
+        if 0 < least <= len(gap):
+            distance = max(distance, float(np.partition(gap, least - 1)[least - 1]))
+        inside = gap <= (distance if least <= len(gap) else np.inf)
         return AuditedError(self.points[inside], self.error[inside])
 
     def quantile(self, confidence: float) -> float:

@@ -63,7 +63,7 @@ def plan_in_region(
     """Plan with the audited error of the region of the motion as the margin.
 
     1. The first margin is the error within 20 cm of the arm at ``ends``. If fewer than 1 / (1 - confidence) points are
-       there, the error of all points counts.
+       there, the region grows until it has as many.
     2. A plan with this margin gives a trajectory, and its region the error that it requires.
     3. If that is larger than the margin, plan again with it.
 
@@ -123,6 +123,6 @@ def _timed(planner: GaussianRRTStar, path: Path, speed: float, acceleration: flo
 
 
 def _around(arm: RobotSpheres, q: Array, error: AuditedError, confidence: float) -> AuditedError:
-    """Return the points near the arm; if too few are there for the confidence, return all points."""
-    near = error.near(arm.centers(np.atleast_2d(q)).reshape(-1, 3), MARGIN.region)
-    return near if len(near) * (1.0 - confidence) >= 1.0 else error
+    """Return the points near the arm, at least as many as the confidence needs."""
+    least = min(len(error), int(np.ceil(1.0 / max(1.0 - confidence, 1e-12))))
+    return error.near(arm.centers(np.atleast_2d(q)).reshape(-1, 3), MARGIN.region, least)

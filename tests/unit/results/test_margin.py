@@ -16,7 +16,7 @@ from splatbot.frame import Frame
 from splatbot.gaussians import GaussianModel
 from splatbot.protocols import Array
 from splatbot.results.folder import RunFolder
-from splatbot.results.margin import own_margin
+from splatbot.results.margin import AuditedError, own_margin
 from splatbot.robots.in_view import reopen_log
 from splatbot.run.masked import MaskedLog
 from splatbot.workspace import fit_workspace
@@ -64,3 +64,22 @@ def test_what_the_run_left_out_does_not_count(mapped: tuple[Path, GaussianModel,
     )
     assert seen > clean + 0.02
     assert left_out <= clean + 0.005
+
+
+@pytest.mark.parametrize(
+    ("distance", "least", "count"), [(0.25, 0, 3), (0.25, 2, 3), (0.25, 6, 6), (0.0, 1, 1), (0.25, 20, 11)]
+)
+def test_the_region_of_a_motion_grows_to_the_nearest_points_until_it_has_enough(
+    distance: float, least: int, count: int
+) -> None:
+    points = np.zeros((11, 3))
+    points[:, 0] = np.arange(11) / 10  # 10 cm apart, the first at the arm
+    error = AuditedError(points[::-1], np.arange(11)[::-1] / 1000)
+    near = error.near(np.zeros((1, 3)), distance, least)
+    assert len(near) == count
+    np.testing.assert_allclose(np.sort(near.error), np.arange(count) / 1000)
+
+
+def test_a_region_without_any_point_has_no_error() -> None:
+    empty = AuditedError(np.zeros((0, 3)), np.zeros(0))
+    assert empty.near(np.zeros((1, 3)), 0.2, 5).quantile(0.999) == 0.0
