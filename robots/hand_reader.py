@@ -176,6 +176,9 @@ def _assembled(file: Path, name: str, body: Sequence[Shape], fingers: Sequence[_
     corners = [finger.vertices() + at for finger, at in zip(fingers, closed, strict=True)]
     inner = float((corners[0] @ y).min()), float((corners[1] @ y).max())
     gap = inner[0] - inner[1]
+    if gap < -CONSTANTS.gap:
+        hint = "correct the limits of the fingers"
+        raise FormatError(f"its closed fingers overlap by {-1e3 * gap:.1f} mm.", file=file, hint=hint)
     x = np.cross(y, z)
     across = np.concatenate(corners) @ x
     middle = (inner[0] + inner[1]) / 2 * y + (across.min() + across.max()) / 2 * x
@@ -201,9 +204,6 @@ def _assembled(file: Path, name: str, body: Sequence[Shape], fingers: Sequence[_
         body_covering=cover(body, COVER.slack) if body else None,
         finger_covering=finger_covering,
     )
-    if gap < -CONSTANTS.gap:
-        hint = "correct the limits of the fingers"
-        raise FormatError(f"its closed fingers overlap by {-1e3 * gap:.1f} mm.", file=file, hint=hint)
     if uncovered(shapes, finger_covering) > 0:
         raise FormatError("its fingers are not contained in spheres.", file=file, hint="simplify their meshes")
     return HandReading(replace(hand, box=_box(hand, shapes)), _notes(first.joint, gap, mass))

@@ -12,7 +12,7 @@ from splatbot.cli import main
 from splatbot.errors import FormatError, InputError
 from splatbot.geometry import inverse, transform_points
 from splatbot.robots.hand_reader import read_hand
-from splatbot.robots.hands import attach, find_hand
+from splatbot.robots.hands import Hand, attach, find_hand
 from splatbot.robots.store import load_robot
 from splatbot.robots.urdf import parse
 
@@ -35,6 +35,12 @@ def _file(folder: Path, text: str = _BOXES) -> Path:
     path = folder / "gripper.urdf"
     path.write_text(text)
     return path
+
+
+@pytest.fixture(scope="module")
+def boxes(tmp_path_factory: pytest.TempPathFactory) -> Hand:
+    """The gripper of boxes, read once."""
+    return read_hand(_file(tmp_path_factory.mktemp("hand"))).hand
 
 
 def _turned(text: str) -> str:
@@ -67,8 +73,8 @@ def test_a_gripper_of_boxes_has_the_sizes_of_its_file(tmp_path: Path, text: str)
 
 
 @pytest.mark.parametrize("opening", [0.01, 0.04, 0.07])
-def test_its_fingers_lie_in_the_spheres_at_every_opening(tmp_path: Path, opening: float) -> None:
-    arm = attach(load_robot("ur5e"), read_hand(_file(tmp_path)).hand)
+def test_its_fingers_lie_in_the_spheres_at_every_opening(boxes: Hand, opening: float) -> None:
+    arm = attach(load_robot("ur5e"), boxes)
     spheres, flange = arm.spheres(opening), load_robot("ur5e").T_link_tcp
     own = spheres.link == len(arm)
     rng = np.random.default_rng(0)
