@@ -9,6 +9,7 @@ alone use them; no check does.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -61,6 +62,24 @@ def appearance(robot: RobotModel, opening: float | None = None) -> list[DrawnPar
         for link, center, radius in zip(spheres.link, spheres.centers, spheres.radii, strict=True)
         if link not in drawn
     ]
+
+
+def coarse_appearance(robot: RobotModel, most: int = 250) -> list[DrawnPart]:
+    """Return :func:`appearance` with at most about ``most`` triangles for each link and colour, for pages that move."""
+    found = []
+    for part in merged(appearance(robot)):
+        corners = part.triangles.reshape(-1, 3)
+        mesh = simplify(corners, np.arange(len(corners)).reshape(-1, 3), most)
+        found.append(replace(part, triangles=np.asarray(mesh.vertices)[np.asarray(mesh.triangles)]))
+    return found
+
+
+def merged(parts: Sequence[DrawnPart]) -> list[DrawnPart]:
+    """Join the parts of a link that have the same colour."""
+    groups: dict[tuple[int, Color], list[Array]] = {}
+    for part in parts:
+        groups.setdefault((part.link, part.color), []).append(part.triangles)
+    return [DrawnPart(link, np.concatenate(triangles), color) for (link, color), triangles in groups.items()]
 
 
 def _has_panda_arm(robot: RobotModel) -> bool:

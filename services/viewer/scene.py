@@ -23,7 +23,7 @@ from splatbot.planning import JointTrajectory
 from splatbot.protocols import Array
 from splatbot.rasterize.views import default_view
 from splatbot.report.robot_drawing import DrawnPart
-from splatbot.robots.appearance import appearance
+from splatbot.robots.appearance import appearance, merged
 from splatbot.robots.robot import RobotModel
 from splatbot.services.viewer.door import Check, guarded, no_connection
 from splatbot.services.viewer.splats import Coloring, pieces
@@ -267,17 +267,6 @@ class ViewerScene:
             wxyz=rotation_to_quat(T[:3, :3]),
             position=T[:3, 3],
         )
-
-
-def merged(parts: Sequence[DrawnPart]) -> list[DrawnPart]:
-    """Join the parts of a link that have the same colour."""
-    groups: dict[tuple[int, tuple[float, ...]], list[Array]] = {}
-    for part in parts:
-        groups.setdefault((part.link, tuple(part.color)), []).append(part.triangles)
-    return [
-        DrawnPart(link, np.concatenate(triangles), (color[0], color[1], color[2]))
-        for (link, color), triangles in groups.items()
-    ]
 
 
 def clearance_colors(

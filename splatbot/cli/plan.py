@@ -89,7 +89,7 @@ def plan(
     from splatbot.gaussians import GaussianModel
     from splatbot.planning import GaussianRRTStar, PoseGoal
     from splatbot.report.plan_page import plan_html, plan_png
-    from splatbot.robots.appearance import appearance
+    from splatbot.robots.appearance import appearance, coarse_appearance
     from splatbot.robots.store import load_robot
 
     arm = load_robot(robot)
@@ -123,7 +123,9 @@ def plan(
         "plan.json": json.dumps(_summary(result, trajectory) | {"covers": covers}, indent=2),
         "trajectory.json": trajectory.to_json(),
         "trajectory.csv": trajectory.to_csv(),
-        "plan.html": plan_html(model, found.planner.arm, field, trajectory, title=title),
+        "plan.html": plan_html(
+            model, found.planner.arm, field, trajectory, coarse_appearance(arm), arm.fk, title=title
+        ),
     }
     writers = {name: write_text(text) for name, text in texts.items()}
     picture = plan_png(model, found.planner.arm, trajectory, appearance(arm), arm.fk)

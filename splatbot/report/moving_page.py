@@ -13,7 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-def moving_page(title: str, facts: str, data: Mapping[str, Any], script: str, *, curve: bool = False) -> str:
+def moving_page(
+    title: str, facts: str, data: Mapping[str, Any], script: str, *, curve: bool = False, toggle: str | None = None
+) -> str:
     """Return the page: a canvas, time controls, and the two scripts that draw.
 
     Args:
@@ -22,10 +24,12 @@ def moving_page(title: str, facts: str, data: Mapping[str, Any], script: str, *,
         data: for the scripts. ``stage.js`` uses ``times`` [s], ``middle`` (3,) and ``distance`` [m].
         script: file in this folder that draws one time step; see ``stage.js``.
         curve: add a canvas for a clearance curve below the view.
+        toggle: label of a checkbox, which the script reads.
     """
     folder = resources.files("splatbot.report")
     own, stage = (folder.joinpath(name).read_text(encoding="utf-8") for name in (script, "stage.js"))
     chart = '<canvas id="curve" title="clearance of the arm; red: contact"></canvas>\n' if curve else ""
+    box = f'<label><input id="toggle" type="checkbox"> {html.escape(toggle)}</label>\n' if toggle else ""
     return f"""<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><title>{html.escape(title)}</title><style>
 body {{ margin: 0; font: 14px system-ui, sans-serif; background: #16181d; color: #e8e8ea; height: 100vh;
@@ -33,13 +37,14 @@ body {{ margin: 0; font: 14px system-ui, sans-serif; background: #16181d; color:
 header, footer {{ padding: 8px 14px; }}
 #view {{ flex: 1; min-height: 0; width: 100vw; display: block; touch-action: none; }}
 #curve {{ height: 90px; width: calc(100vw - 28px); margin: 0 14px; cursor: pointer; }}
-footer {{ display: flex; gap: 12px; align-items: center; }} input {{ flex: 1; }} #play {{ width: 5em; }}
+footer {{ display: flex; flex-wrap: wrap; gap: 12px; align-items: center; }} 
+input[type="range"] {{ flex: 1; min-width: 8em; }} #play {{ width: 5em; }}
 </style></head><body>
 <header><b>{html.escape(title)}</b> &nbsp; {html.escape(facts)}</header>
 <canvas id="view"></canvas>
 {chart}<footer><button id="back" title="one step back">&#9664;</button><button id="play">play</button>
 <button id="on" title="one step forward">&#9654;</button><input id="time" type="range" min="0" value="0">
-<span id="label"></span></footer>
+<span id="label"></span>{box}</footer>
 <script type="application/json" id="data">{json.dumps(data)}</script>
 <script>{own}</script>
 <script>{stage}</script>

@@ -48,15 +48,24 @@ _EYE, _TARGET = np.array([-0.9, 1.3, 1.2]), np.array([0.4, 0.0, 0.2])  # camera 
 
 
 def plan_html(
-    model: GaussianModel, arm: RobotSpheres, field: GaussianCollisionField, trajectory: JointTrajectory, *, title: str
+    model: GaussianModel,
+    arm: RobotSpheres,
+    field: GaussianCollisionField,
+    trajectory: JointTrajectory,
+    parts: Sequence[DrawnPart],
+    fk: Callable[[Array], Array],
+    *,
+    title: str,
 ) -> str:
-    """Return the page: the map's Gaussians as points, the arm as spheres, and a slider for time.
+    """Return the page: the map's Gaussians as points, the arm as meshes or certified spheres, and a slider for time.
 
     Args:
         model: the map.
         arm: collision spheres of the robot with the pose of its base.
         field: collision field of the map.
         trajectory: the planned trajectory.
+        parts: appearance of the robot; few triangles let the page move smoothly.
+        fk: returns the poses T_base_link (K, L, 4, 4) of its links at joint positions (K, J).
         title: heading.
     """
     times = np.linspace(0.0, trajectory.duration, CONSTANTS.frames)
@@ -67,6 +76,7 @@ def plan_html(
     last = int(np.flatnonzero(arm.spheres.link == arm.spheres.link.max())[-1])
     tool = centers.reshape(CONSTANTS.frames, -1, 3)[:, last]
     clearances = np.minimum(arm.clearance(field, q, cut=0.5).distance, 0.5)
+    links = fk(q)
     middle = np.median(points, axis=0) if len(points) else np.zeros(3)
     document = {
         "points": packed(points, np.float32),
@@ -74,6 +84,11 @@ def plan_html(
         "spheres": packed(centers, np.float32),
         "radii": arm.spheres.radii.round(4).tolist(),
         "tool": packed(tool, np.float32),
+        "corners": packed(np.concatenate([part.triangles.reshape(-1, 9) for part in parts]), np.float32),
+        "link": packed(np.repeat([part.link for part in parts], [len(part.triangles) for part in parts]), np.uint16),
+        "shades": packed(bytes_of(np.concatenate([np.tile(p.color, (len(p.triangles), 1)) for p in parts])), np.uint8),
+        "poses": packed(links[:, :, :3], np.float32),
+        "links": int(links.shape[1]),
         "times": times.round(4).tolist(),
         "clearances": clearances.round(4).tolist(),
         "middle": middle.round(3).tolist(),
@@ -85,7 +100,7 @@ def plan_html(
         f"{trajectory.duration:.2f} s; {'certified' if c.certified else 'NOT certified'}, clearance at least "
         f"{1e3 * c.clearance:.1f} mm beyond a margin of {1e3 * c.margin:.1f} mm; map version {c.map_version}"
     )
-    return moving_page(title, facts, document, "plan_view.js")
+    return moving_page(title, facts, document, "plan_view.js", toggle="certified spheres")
 
 
 def plan_png(

@@ -1,6 +1,6 @@
-// Draws points far to near on a canvas and animates them: drag rotates, wheel zooms, the slider scrubs; buttons, space and
+// Draws points and triangles far to near on a canvas and animates them: drag rotates, wheel zooms, the slider scrubs; buttons, space and
 // arrow keys play and step; #t=1.5 at the end of the address starts at that time [s]. The page's own script runs first and
-// defines scene(drawPoint, at), which draws the points of time step `at`, and caption(at).
+// defines scene(drawPoint, at, drawTriangle), which draws time step `at`, and caption(at).
 "use strict";
 const canvas = document.getElementById("view"), slider = document.getElementById("time"), label = document.getElementById("label");
 const pen = canvas.getContext("2d"), steps = data.times.length, button = document.getElementById("play");
@@ -25,11 +25,33 @@ function draw() {
     const size = (f * radius) / depth;
     if (u > -size && v > -size && u < w + size && v < h + size) shown.push([depth, u, v, size, r, g, b]);
   };
-  scene(drawPoint, at);
+  const project = (px, py, pz) => {
+    const d = [px - m[0], py - m[1], pz - m[2]];
+    const depth = distance + d[0] * z[0] + d[1] * z[1] + d[2] * z[2];
+    return [w / 2 + (f * (d[0] * x[0] + d[1] * x[1] + d[2] * x[2])) / depth, h / 2 + (f * (d[0] * y[0] + d[1] * y[1] + d[2] * y[2])) / depth, depth];
+  };
+  const drawTriangle = (a, b, c, shade, alpha) => {  // corners [x, y, z] m; lit from the camera
+    const p = project(...a), q = project(...b), r = project(...c);
+    if (Math.min(p[2], q[2], r[2]) < 0.05) return;
+    const e = [b[0] - a[0], b[1] - a[1], b[2] - a[2]], g = [c[0] - a[0], c[1] - a[1], c[2] - a[2]];
+    const n = [e[1] * g[2] - e[2] * g[1], e[2] * g[0] - e[0] * g[2], e[0] * g[1] - e[1] * g[0]];
+    const light = Math.abs(n[0] * z[0] + n[1] * z[1] + n[2] * z[2]) / (Math.hypot(...n) || 1), k = 0.35 + 0.65 * light;
+    shown.push([(p[2] + q[2] + r[2]) / 3, p, q, r, k * shade[0], k * shade[1], k * shade[2], alpha]);
+  };
+  scene(drawPoint, at, drawTriangle);
   shown.sort((a, b) => b[0] - a[0]);
   pen.fillStyle = "#16181d";
   pen.fillRect(0, 0, w, h);
-  for (const [, u, v, size, r, g, b] of shown) {
+  for (const [, u, v, size, r, g, b, alpha] of shown) {
+    if (alpha !== undefined) {
+      pen.fillStyle = pen.strokeStyle = `rgba(${r},${g},${b},${alpha})`;
+      pen.beginPath();
+      for (const corner of [u, v, size]) pen.lineTo(corner[0], corner[1]);
+      pen.closePath();
+      pen.fill();
+      pen.stroke();
+      continue;
+    }
     pen.fillStyle = `rgb(${r},${g},${b})`;
     if (size < 3) {
       const side = Math.max(1, 2 * size);

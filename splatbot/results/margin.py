@@ -61,10 +61,11 @@ class AuditedError:
 
         If fewer than ``least`` points are there, the nearest ``least`` points are returned.
         """
-        gap, _ = cKDTree(np.asarray(centers, dtype=np.float64).reshape(-1, 3)).query(self.points)
-        if 0 < least <= len(gap):
-            distance = max(distance, float(np.partition(gap, least - 1)[least - 1]))
-        inside = gap <= (distance if least <= len(gap) else np.inf)
+        tree = cKDTree(np.asarray(centers, dtype=np.float64).reshape(-1, 3))
+        inside = np.isfinite(tree.query(self.points, distance_upper_bound=distance)[0])
+        if np.count_nonzero(inside) < least:  # rare, and slower without a bound
+            gap = tree.query(self.points)[0]
+            inside = gap <= (np.partition(gap, least - 1)[least - 1] if least <= len(gap) else np.inf)
         return AuditedError(self.points[inside], self.error[inside])
 
     def quantile(self, confidence: float) -> float:

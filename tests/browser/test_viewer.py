@@ -16,6 +16,8 @@ from splatbot.gaussians import GaussianModel, Snapshot
 from splatbot.geometry import inverse, look_at, pose_from_quat, transform_points
 from splatbot.planning import Certificate, JointTrajectory
 from splatbot.rasterize.views import render_view
+from splatbot.report.plan_page import plan_html
+from splatbot.robots.appearance import coarse_appearance
 from splatbot.robots.store import load_robot
 from splatbot.service_key import key_file, read_key
 from splatbot.services.access import Access
@@ -179,6 +181,26 @@ def test_the_page_needs_nothing_else_and_shows_the_same_colours(browser: Chromiu
         if red > 0.05 and blue > 0.05:
             return
     raise AssertionError(f"red on {red:.1%}, blue on {blue:.1%} of the page")
+
+
+def test_the_page_of_a_plan_shows_meshes_or_certified_spheres(browser: Chromium, tmp_path: Path) -> None:
+    robot = load_robot("ur5e-2f85")
+    q = np.asarray(robot.home) + np.linspace(0.0, 0.5, 14)[:, None] * np.eye(6)[0]
+    plan = JointTrajectory(robot.chain.names, q, 0.1, Certificate(True, 1e-3, 0.0, 0.0, 1))
+    model, arm = GaussianModel.empty(), RobotSpheres(robot, T_world_base=np.eye(4))
+    parts, field = coarse_appearance(robot), GaussianCollisionField(model)
+    (tmp_path / "plan.html").write_text(plan_html(model, arm, field, plan, parts, robot.fk, title="a plan"))
+    browser.open(f"file://{tmp_path / 'plan.html'}")
+    time.sleep(1.0)
+    meshes = browser.screenshot().astype(int)
+    browser.evaluate("document.getElementById('toggle').click()")
+    time.sleep(0.5)
+    spheres = browser.screenshot().astype(int)
+    drawn, covered = (image[40:-60].max(axis=2) > 60 for image in (meshes, spheres))
+    assert drawn.mean() > 0.01
+    assert (drawn & ~covered).sum() < 0.05 * drawn.sum()  # the spheres contain the meshes
+    assert covered.sum() > drawn.sum()
+    assert browser.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
 
 
 def test_a_scene_sends_again_only_what_has_changed() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import csv
 import json
 from pathlib import Path
@@ -50,6 +51,12 @@ def test_a_certified_trajectory_is_written_with_its_pictures(run: RunCommand, ma
     assert "http://" not in page
     assert "https://" not in page
     assert page.count("<script") == 3
+    data = json.loads(page.split('id="data">')[1].split("</script>")[0])
+    link = np.frombuffer(base64.b64decode(data["link"]), np.uint16)
+    assert set(link) == set(range(8))
+    assert len(link) < 6000
+    poses = np.frombuffer(base64.b64decode(data["poses"]), np.float32).reshape(-1, 8, 3, 4)
+    np.testing.assert_allclose(poses[-1], panda().fk(np.array(GOAL))[:, :3], atol=1e-5)
 
 
 def test_the_base_is_taken_from_the_scene_file_of_the_map_and_a_pose_is_reached(

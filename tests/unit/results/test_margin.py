@@ -67,7 +67,7 @@ def test_what_the_run_left_out_does_not_count(mapped: tuple[Path, GaussianModel,
 
 
 @pytest.mark.parametrize(
-    ("distance", "least", "count"), [(0.25, 0, 3), (0.25, 2, 3), (0.25, 6, 6), (0.0, 1, 1), (0.25, 20, 11)]
+    ("distance", "least", "count"), [(0.25, 0, 3), (0.25, 2, 3), (0.25, 6, 6), (0.05, 1, 1), (0.25, 20, 11)]
 )
 def test_the_region_of_a_motion_grows_to_the_nearest_points_until_it_has_enough(
     distance: float, least: int, count: int
