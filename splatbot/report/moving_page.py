@@ -37,7 +37,7 @@ body {{ margin: 0; font: 14px system-ui, sans-serif; background: #16181d; color:
 header, footer {{ padding: 8px 14px; }}
 #view {{ flex: 1; min-height: 0; width: 100vw; display: block; touch-action: none; }}
 #curve {{ height: 90px; width: calc(100vw - 28px); margin: 0 14px; cursor: pointer; }}
-footer {{ display: flex; flex-wrap: wrap; gap: 12px; align-items: center; }} 
+footer {{ display: flex; flex-wrap: wrap; gap: 12px; align-items: center; }}
 input[type="range"] {{ flex: 1; min-width: 8em; }} #play {{ width: 5em; }}
 </style></head><body>
 <header><b>{html.escape(title)}</b> &nbsp; {html.escape(facts)}</header>
