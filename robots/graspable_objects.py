@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from splatbot.collision.visibility import DepthView, gather_evidence
 from splatbot.errors import SplatbotError
 from splatbot.gaussians import GaussianModel, Snapshot
+from splatbot.grasping.measured import CONSTANTS as MEASURED
 from splatbot.grasping.measured import RawDepth
 from splatbot.grasping.sampler import GraspSampler
 from splatbot.grasping.types import GraspResult
@@ -86,7 +87,7 @@ def measured_map(state: Snapshot, run: RunFolder | None) -> MeasuredMap:
     try:
         log = reopen_log(run)
         views, sensor = subsampled_views(run, log), run.load_config().sensor
-        raw = RawDepth(raw_views(run, log)[1], sensor.sigma_depth_floor, sensor.sigma_depth_quad)
+        raw = RawDepth(raw_views(run, log, MEASURED.frames)[1], sensor.sigma_depth_floor, sensor.sigma_depth_quad)
     except SplatbotError as error:
         name = f"{Path(error.file).name}: " if error.file else ""  # without the private path of the folder
         reason = f"the run's log cannot be read: {name}{error.message}"

@@ -15,6 +15,9 @@ from splatbot.robots.cover import FINE, cover
 from splatbot.robots.description import read_description, visual_of
 from splatbot.robots.maker_meshes import ReportProgress
 from splatbot.robots.robot import Inertial, RobotModel
+from splatbot.robots.shapes import Mesh
+
+_MOUNTING = -0.005  # [m] height of the mounting plane, with a tolerance
 
 
 def described(name: str) -> RobotModel:
@@ -51,8 +54,15 @@ def fit_arm(name: str, report_progress: ReportProgress) -> RobotModel:
     covering = LinkSpheres(fitted.link, *rounded(fitted.centers, fitted.radii))
     if uncovered(robot.shapes, covering) > 0:
         raise InputError("is not contained after rounding.", field=name, hint="fit with another slack")
-    visual = visual_of(description_of(arm.source), tip=arm.tip)
+    visual = tuple(_mounted(mesh) for mesh in visual_of(description_of(arm.source), tip=arm.tip))
     return replace(robot, covering=covering, inertials=inertials, visual=visual)
+
+
+def _mounted(mesh: Mesh) -> Mesh:
+    """Drop the parts of a base's picture that hang below its mounting plane, as the UR5e's cable."""
+    if mesh.link:
+        return mesh
+    return replace(mesh, faces=mesh.faces[mesh.vertices[mesh.faces, 2].max(axis=1) > _MOUNTING])
 
 
 def _inertials(arm: ShippedArm, robot: RobotModel) -> tuple[Inertial, ...]:

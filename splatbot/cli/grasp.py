@@ -257,5 +257,6 @@ def _print(result: GraspResult, folder: Path) -> None:
         table.add_row(str(k), f"{g.total:.3f}", f"{g.confidence:.2f}", g.approach, *lengths, *contact, *values)
     print_columns(table)
     print_text("the best total and the best value of a term is 1")
+    print_text("confidence: share of such grasps that succeeded in simulation; errors of the map are not in it")
     if contacts:
         print_text("a measured contact is within 3 mm of depth that three frames agree on; an implied one is not")

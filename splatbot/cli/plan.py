@@ -214,6 +214,7 @@ def _covers(found: RegionPlan, model: GaussianModel, n_sigma: float, unknown: st
         "map_gaussians": len(model),
         "n_sigma": n_sigma,
         "self_collision": True,
+        "base": False,
         "unknown_space": unknown,
         "margin_m": found.planner.margin,
         "margin_from": "audit" if audited else "user" if found.planner.margin > 0 else "none",
@@ -240,8 +241,9 @@ def _print(result: PlanResult, trajectory: JointTrajectory, covers: dict[str, An
         ("length", f"{result.path.cost:.3f} rad, {len(result.path)} waypoints"),
         ("duration", f"{trajectory.duration:.3f} s"),
         ("certified", "yes" if c.certified else "NO"),
-        ("clearance along the path", f"{1e3 * c.clearance:.1f} mm beyond a margin of {1e3 * c.margin:.1f} mm"),
-        ("covers", f"the map at {covers['n_sigma']:g} sigma, and self-collision"),
+        ("clearance", f"at least {1e3 * c.clearance:.1f} mm beyond a margin of {1e3 * c.margin:.1f} mm"),
+        ("covers", f"moving links against the map at {covers['n_sigma']:g} sigma and against the arm itself"),
+        ("base", "not covered: the mounted link is not checked against the map"),
         ("unknown space", _UNKNOWN[covers["unknown_space"]]),
         ("margin", _margin_text(covers)),
         ("written to", str(folder)),
@@ -253,6 +255,6 @@ def _margin_text(covers: dict[str, Any]) -> str:
     if covers["margin_from"] != "audit":
         return {"user": "as given", "none": "0, so that errors of the map are not covered"}[covers["margin_from"]]
     return (
-        f"covers {100 * covers['confidence']:g} % of {covers['region_points']} measured points, "
-        f"error {1e3 * covers['region_error_m']:.1f} mm"
+        f"audited: {100 * covers['confidence']:g} % of {covers['region_points']} measured points near the motion are "
+        f"within {1e3 * covers['region_error_m']:.1f} mm of the map; earlier paths may require more"
     )

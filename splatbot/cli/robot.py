@@ -228,6 +228,7 @@ def _info(name: str) -> None:
             ("spheres", f"{len(spheres)}, radius {spheres.radii.min():.3f} .. {spheres.radii.max():.3f} m"),
             ("slack", f"{1e3 * model.slack:.3g} mm"),
             ("pairs of links that may not touch", str(len(model.self_collision_pairs))),
+            ("home", " ".join(f"{value:.4g}" for value in model.home)),
             ("gripper", f"opens {2 * model.gripper.stroke:g} m" if model.gripper else "none"),
         ]
     )

@@ -210,13 +210,17 @@ def _scores(attributes: _ObjectAttributes, text: str) -> tuple[Array, tuple[str,
         if word in SIZES:
             best_of.append(word)
             continue
+        if word.isdigit():  # labels are printed with numbers: "grey box 27"
+            scores = scores * np.array([float(item.number == int(word)) for item in attributes.scene.objects])
+            continue
         rule = _rule(word)
         if rule is None:
             known = ", ".join((*COLORS, *(w for words in SHAPES.values() for w in words), *SIZES, *RELATIONS))
+            ways = "name it in scene.yaml, point at it, write 'object N' as `splatbot objects` numbers it, or use"
             raise AffordanceError(
                 f"has {raw!r}, which is neither a name of the scene nor in the vocabulary.",
                 field=text.strip() or raw,
-                hint=f"name it in scene.yaml, point at it, or use: {known}",
+                hint=f"{ways}: {known}",
             )
         scores = scores * rule(attributes)
         notes.append(word)

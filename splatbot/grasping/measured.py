@@ -27,6 +27,7 @@ class MeasuredDepthConstants:
         contact_distance: [m] largest distance of a measured contact from the nearest confirmed point.
         spacing: [m] edge of the voxels in which each frame proposes one point.
         fine_spacing: [m] the same for the last check of one grasp.
+        frames: largest number of raw depth images of a recording (150 MB).
         max_points: largest number of points that are confirmed; it bounds the work.
         hands_per_chunk: hands that are evaluated at once; it bounds memory.
     """
@@ -36,6 +37,7 @@ class MeasuredDepthConstants:
     contact_distance: float = 0.003
     spacing: float = 0.003
     fine_spacing: float = 0.001
+    frames: int = 120
     max_points: int = 60_000
     hands_per_chunk: int = 16
 
@@ -76,11 +78,18 @@ class RawDepth:
             most=CONSTANTS.max_points,
         )
 
-    def at_fingers(self, hands: Hands, hand: HandShape) -> Array:
-        """Return the confirmed surface points (S, 3) [m, world] in a box around the fingers of one hand, densely."""
-        x, y = hand.width / 2, hands.opening[0] / 2 + hand.thickness
+    def along_approach(self, hands: Hands, hand: HandShape, retreat: float) -> Array:
+        """Return the confirmed surface points (S, 3) [m, world] in a box around one hand and its approach, densely.
+
+        Args:
+            hands: one hand.
+            hand: shape of the hand.
+            retreat: length of the straight approach [m].
+        """
+        x = max(hand.width, hand.palm_size[0]) / 2
+        y = max(hands.opening[0] / 2 + hand.thickness, hand.palm_size[1] / 2)
         signs = [(sx, sy) for sx in (-1, 1) for sy in (-1, 1)]
-        corners = np.array([[sx * x, sy * y, z] for sx, sy in signs for z in (-hand.palm, hand.tip)])
+        corners = np.array([[sx * x, sy * y, z] for sx, sy in signs for z in (-hand.palm - retreat, hand.tip)])
         at = transform_points(hands.T[0], corners)
         return confirmed_near(
             self.views,

@@ -346,13 +346,19 @@ class Search:
         return replace(found, q=reached.q, q_pregrasp=reached.path[0], approach_path=reached.path), ""
 
     def _at_full_density(self, grasp: Grasp, raw: RawDepth) -> tuple[Grasp, str]:
-        """Check the fingers with all confirmed points around them; the kind of rejection is empty if they are free."""
-        hands = Hands.one(grasp.T_world_tcp, grasp.opening)
-        points = raw.at_fingers(hands, self.s.hand)
-        deep = float(hand_penetration(hands, points, self.s.hand, retreat=0.0)[0])
+        """Check the hand with all confirmed points around it and its approach; no kind of rejection if it is free.
+
+        The width grows to that at which the points stop the fingers, and the closed hand is checked too.
+        """
+        hands, retreat = Hands.one(grasp.T_world_tcp, grasp.opening), self.o.pregrasp
+        points = raw.along_approach(hands, self.s.hand, retreat)
+        width = max(grasp.width, float(closed_width(hands, points, self.s.hand)[0]))
+        deep = max(
+            float(hand_penetration(hands, points, self.s.hand, retreat=retreat)[0]),
+            float(hand_penetration(Hands.one(grasp.T_world_tcp, width), points, self.s.hand, retreat=0.0)[0]),
+        )
         if deep > MEASURED.max_penetration:
             return replace(grasp, rejected=f"is {1e3 * deep:.1f} mm deep in measured depth"), "are in measured depth"
-        width = max(grasp.width, float(closed_width(hands, points, self.s.hand)[0]))
         assert grasp.depth_distance is not None
         away = np.minimum(grasp.depth_distance, contact_distances(grasp.contacts, points))
         measured = float((away <= MEASURED.contact_distance).mean())

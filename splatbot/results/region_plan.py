@@ -20,11 +20,13 @@ class RegionPlanConstants:
     """Constants of planning with the margin of a region.
 
     Args:
-        rounds: largest number of plans; each has the margin that the path before required.
+        rounds: largest number of plans; each has the margin that the path before required, and a little more.
+        growth: factor of that margin, so that the rounds end although each path passes other points.
         samples: number of configurations of a trajectory that define its region.
     """
 
-    rounds: int = 5
+    rounds: int = 8
+    growth: float = 1.1
     samples: int = 200
 
 
@@ -65,7 +67,7 @@ def plan_in_region(
     1. The first margin is the error within 20 cm of the arm at ``ends``. If fewer than 1 / (1 - confidence) points are
        there, the region grows until it has as many.
     2. A plan with this margin gives a trajectory, and its region the error that it requires.
-    3. If that is larger than the margin, plan again with it.
+    3. If that is larger than the margin, plan again with 1.1 times the error.
 
     The margins increase, so that the last margin covers the region of the last trajectory.
 
@@ -79,7 +81,7 @@ def plan_in_region(
         acceleration: fraction of the limits of acceleration, 0..1; by default ``speed``.
 
     Raises:
-        InputError: the margins still increase after five plans, or the confidence is not in 0..1.
+        InputError: the margins still increase after eight plans, or the confidence is not in 0..1.
     """
     if not 0.0 <= confidence <= 1.0:
         raise InputError(f"is {confidence}.", field="confidence", hint="give a value in 0..1, as 0.999")
@@ -95,7 +97,7 @@ def plan_in_region(
         required = region.quantile(confidence)
         if required <= margin:
             return RegionPlan(planner, result, trajectory, len(region), required)
-        margin = required
+        margin = CONSTANTS.growth * required
     raise InputError(
         f"is at least {1e3 * margin:.1f} mm, and each path through it requires more.",
         field="margin",

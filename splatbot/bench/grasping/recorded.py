@@ -28,7 +28,7 @@ from splatbot.robots.panda import panda
 from splatbot.workspace import find_workspace
 
 HANDS = {"panda": panda, "panda-2f85": panda_2f85, "panda-2f140": panda_2f140}
-_FRAMES = 120  # whose depth checks the grasps; the sampler uses at most 40
+_FRAMES = 240  # whose depth checks the grasps; the search reads at most 120
 _MIN_OBSERVATIONS = 3
 _DEEP_M = 0.003  # of a confirmed point in a hand
 
@@ -69,7 +69,9 @@ def _measure(results: Results, case: str, path: Path, name: str, raw: RawDepth, 
         counts["objects with grasps on implied sides alone"] += bool(result.doubtful) and not result.grasps
         counts["grasps"] += len(result.grasps)
         for grasp in result.grasps:
-            measured = np.concatenate([around, raw.at_fingers(Hands.one(grasp.T_world_tcp, grasp.opening), hand)])
+            measured = np.concatenate(
+                [around, raw.along_approach(Hands.one(grasp.T_world_tcp, grasp.opening), hand, GraspOptions().pregrasp)]
+            )
             deep = _deepest(grasp, measured, hand)
             deepest.append(deep)
             counts["hands deeper than 3 mm in confirmed depth"] += deep > _DEEP_M

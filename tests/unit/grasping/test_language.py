@@ -40,6 +40,18 @@ def test_queries_find_the_object(text: str, thing: str) -> None:
     assert 0.0 < found.score <= 1.0
 
 
+@pytest.mark.parametrize("number", [one.number for one in scene().objects if not one.name])
+def test_a_label_with_its_number_finds_that_object(number: int) -> None:
+    """`splatbot objects` prints labels as "grey box 27"."""
+    for text in (f"object {number}", f"thing {number}"):
+        assert _find(text).number == number
+
+
+def test_a_number_that_no_object_has_is_refused() -> None:
+    with pytest.raises(AffordanceError):
+        _find("object 99")
+
+
 @pytest.mark.parametrize("text", ["soup", "tin of soup", "the Soup"])
 def test_names_of_the_scene_file_come_first(text: str) -> None:
     found = _find(text)

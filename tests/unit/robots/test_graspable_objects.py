@@ -57,7 +57,7 @@ def run_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     Workspace(T_world_base=np.eye(4)).save(run.path / "scene.yaml")
     monkeypatch.setattr("splatbot.robots.graspable_objects.reopen_log", lambda run: None)
     monkeypatch.setattr("splatbot.robots.graspable_objects.subsampled_views", lambda run, log: VIEWS)
-    monkeypatch.setattr("splatbot.robots.graspable_objects.raw_views", lambda run, log: (list(range(8)), VIEWS))
+    monkeypatch.setattr("splatbot.robots.graspable_objects.raw_views", lambda run, log, most: (list(range(8)), VIEWS))
     return run.path
 
 
