@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from dataclasses import dataclass
+from typing import Any
 from uuid import uuid4
 
 import numpy as np
@@ -36,6 +37,7 @@ class Plan:
         result: of the search; it has a path.
         trajectory: the path with its time.
         margin_source: where its margin comes from.
+        covers: scope of the certificate, see :meth:`splatbot.results.region_plan.RegionPlan.scope`.
     """
 
     id: str
@@ -46,6 +48,7 @@ class Plan:
     result: PlanResult
     trajectory: JointTrajectory
     margin_source: str
+    covers: dict[str, Any]
 
     @property
     def motion(self) -> MotionRequest:
@@ -69,10 +72,19 @@ class Plans:
         result: PlanResult,
         trajectory: JointTrajectory,
         margin_source: str,
+        covers: dict[str, Any],
     ) -> Plan:
         """Keep a plan."""
         plan = Plan(
-            uuid4().hex[:16], served.id, served.generation, robot, T_world_base, result, trajectory, margin_source
+            uuid4().hex[:16],
+            served.id,
+            served.generation,
+            robot,
+            T_world_base,
+            result,
+            trajectory,
+            margin_source,
+            covers,
         )
         with self._lock:
             self._plans[plan.id] = plan

@@ -40,6 +40,7 @@ _ANSWER = {
     "clearance_m": 0.05,
     "margin_m": 0.006,
     "margin_source": "audited error of the map in the region of the motion",
+    "covers": {"n_sigma": 2.0, "self_collision": True, "base": False, "unknown_space": "free", "region_points": 5831},
     "waypoints": [[0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785], [0.3, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785]],
     "trajectory": {"joint_names": ["panda_joint1"], "points": []},
 }
@@ -94,7 +95,8 @@ def plan(request: Request, served: ServedAfterFrames, service: Service, query: _
             field="rate",
             hint=hint,
         )
-    kept = service.plans.add(served, robot.name, base, result, trajectory, source.why)
+    covers = found.scope(n_sigma=served.field.n_sigma, unknown="free", confidence=query.confidence)
+    kept = service.plans.add(served, robot.name, base, result, trajectory, source.why, covers)
     service.store.tell(served, PLAN, trajectory)
     return answer(request, _description(kept, query.rate))
 
@@ -151,6 +153,7 @@ def _description(plan: Plan, rate: float | None) -> dict[str, Any]:
         "clearance_m": certificate.clearance,
         "margin_m": certificate.margin,
         "margin_source": plan.margin_source,
+        "covers": plan.covers,
         "waypoints": np.asarray(path.waypoints),
         "trajectory": trajectory.to_ros(rate=rate),
     }

@@ -241,7 +241,7 @@ def _print_summary(result: RunResult) -> None:
         ("PSNR, held-out views", decibels(m["psnr_holdout_db"])),
         ("depth error, median", metres(m["depth_median_m"])),
         ("Gaussians", f"{count(m['gaussians'])}, {megabytes(m['map_bytes'])}"),
-        ("time per frame", f"{milliseconds(ms['p50'])} (p95 {milliseconds(ms['p95'])})"),
+        ("time per frame", f"median {milliseconds(ms['p50'])}, 95 % {milliseconds(ms['p95'])}"),
         *(("question", doubt) for doubt in run_doubts(m)),
         ("report", str(result.folder / "report.html")),
     ]

@@ -116,7 +116,7 @@ def plan(
     result, trajectory = found.result, found.trajectory
     result.unwrap()
     assert trajectory is not None
-    covers = _covers(found, model, n_sigma, unknown, confidence)
+    covers = found.scope(n_sigma=n_sigma, unknown=unknown, confidence=confidence)
     folder = out if out is not None else Path("runs") / "plan"
     title = f"{arm.name} in {map.resolve().name}"
     texts = {
@@ -204,23 +204,6 @@ def _summary(result: PlanResult, trajectory: JointTrajectory) -> dict[str, Any]:
         "clearance_m": c.clearance,
         "margin_m": c.margin,
         "map_version": c.map_version,
-    }
-
-
-def _covers(found: RegionPlan, model: GaussianModel, n_sigma: float, unknown: str, confidence: float) -> dict[str, Any]:
-    """Describe the scope of the certificate: obstacles, unknown space, and the origin of the margin."""
-    audited = found.points is not None
-    return {
-        "map_gaussians": len(model),
-        "n_sigma": n_sigma,
-        "self_collision": True,
-        "base": False,
-        "unknown_space": unknown,
-        "margin_m": found.planner.margin,
-        "margin_from": "audit" if audited else "user" if found.planner.margin > 0 else "none",
-        "confidence": confidence if audited else None,
-        "region_points": found.points,
-        "region_error_m": found.error,
     }
 
 

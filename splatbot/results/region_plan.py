@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -50,6 +51,28 @@ class RegionPlan:
     trajectory: JointTrajectory | None
     points: int | None
     error: float | None
+
+    def scope(self, *, n_sigma: float, unknown: str, confidence: float) -> dict[str, Any]:
+        """Describe the scope of the certificate: obstacles, unknown space, and the origin of the margin.
+
+        Args:
+            n_sigma: surface of the map's Gaussians, in standard deviations.
+            unknown: how unknown space counts: "free", "cautious" or "occupied".
+            confidence: share of the measured surface that an audited margin covers.
+        """
+        audited, margin = self.points is not None, self.planner.margin
+        return {
+            "map_gaussians": len(self.planner.field),
+            "n_sigma": n_sigma,
+            "self_collision": True,
+            "base": False,
+            "unknown_space": unknown,
+            "margin_m": margin,
+            "margin_from": "audit" if audited else "user" if margin > 0 else "none",
+            "confidence": confidence if audited else None,
+            "region_points": self.points,
+            "region_error_m": self.error,
+        }
 
 
 def plan_in_region(
