@@ -108,25 +108,17 @@ def read_hand(path: str | Path) -> HandReading:
 
 def _parts(reader: UrdfReader, joints: Sequence[ElementTree.Element]) -> tuple[list[Shape], list[_Finger]]:
     """Return the shapes of the body and both fingers in the frame of the first link."""
-    roots = [link for link in reader.links if link not in reader.joint_to]
-    if len(roots) != 1:
-        raise FormatError(f"has {len(roots)} root links.", file=reader.file, hint="a URDF has one")
-    placed: dict[str, tuple[int, Array]] = {roots[0]: (0, np.eye(4))}  # 0: body, k: finger k
+    placed: dict[str, tuple[int, Array]] = {reader.root_link(): (0, np.eye(4))}  # 0: body, k: finger k
     along: dict[int, Array] = {}
-    left = dict(reader.joint_to)
-    while ready := [child for child, e in left.items() if reader.link(e, "parent") in placed]:
-        for child in ready:
-            e = left.pop(child)
-            part, T = placed[reader.link(e, "parent")]
-            T = T @ origin(e)
-            if e in joints:
-                if part:
-                    raise FormatError("carries a finger.", file=reader.file, field=reader.name(joints[part - 1]))
-                part = joints.index(e) + 1
-                along[part] = T[:3, :3] @ reader.axis(e)
-            placed[child] = (part, T)
-    if left:
-        raise FormatError("has links in a circle.", file=reader.file, field=next(iter(left)), hint="a URDF is a tree")
+    for child, e in reader.outwards():
+        part, T = placed[reader.link(e, "parent")]
+        T = T @ origin(e)
+        if e in joints:
+            if part:
+                raise FormatError("carries a finger.", file=reader.file, field=reader.name(joints[part - 1]))
+            part = joints.index(e) + 1
+            along[part] = T[:3, :3] @ reader.axis(e)
+        placed[child] = (part, T)
     shapes: list[list[Shape]] = [[], [], []]
     for link, (part, T) in placed.items():
         shapes[part] += [named.shape for named in reader.shapes(link, 0, T)]
@@ -155,18 +147,9 @@ def _limits(reader: UrdfReader, joints: Sequence[ElementTree.Element]) -> list[t
 
 def _assembled(file: Path, name: str, body: Sequence[Shape], fingers: Sequence[_Finger], mass: float) -> HandReading:
     """Build the hand: its frame between the fingers, their inner faces, stroke and spheres."""
-    first, second = fingers  # 0: of the first one, whose direction of opening is y
+    first, second = fingers
     z = np.array([0.0, 0.0, 1.0])
-    y = np.asarray(first.along)
-    if abs(y @ second.along) < CONSTANTS.parallel:
-        raise FormatError("its fingers do not move along one line.", file=file, hint="give a parallel gripper")
-    if abs(y @ z) > CONSTANTS.upright:
-        hint = "turn the first link, so that its z axis points from the flange to the tips"
-        raise FormatError("its fingers do not open across the z axis of the first link.", file=file, hint=hint)
-    apart = float((first.vertices().mean(0) - second.vertices().mean(0)) @ y)
-    if apart < 0 or (apart == 0 and sum(first.limits) < 0):
-        y = -y
-    y = (y - (y @ z) * z) / np.linalg.norm(y - (y @ z) * z)
+    y = _opening_direction(file, first, second)
     closed, strokes = [], []
     for finger, outwards in ((first, y), (second, -y)):
         sign = float(np.sign(finger.along @ outwards))
@@ -207,6 +190,25 @@ def _assembled(file: Path, name: str, body: Sequence[Shape], fingers: Sequence[_
     if uncovered(shapes, finger_covering) > 0:
         raise FormatError("its fingers are not contained in spheres.", file=file, hint="simplify their meshes")
     return HandReading(replace(hand, box=_box(hand, shapes)), _notes(first.joint, gap, mass))
+
+
+def _opening_direction(file: Path, first: _Finger, second: _Finger) -> Array:
+    """Return the unit direction (3,) across the z axis in which the first finger opens.
+
+    Raises:
+        FormatError: the fingers do not move along one line across the z axis.
+    """
+    y = np.asarray(first.along)
+    if abs(y @ second.along) < CONSTANTS.parallel:
+        raise FormatError("its fingers do not move along one line.", file=file, hint="give a parallel gripper")
+    if abs(y[2]) > CONSTANTS.upright:
+        hint = "turn the first link, so that its z axis points from the flange to the tips"
+        raise FormatError("its fingers do not open across the z axis of the first link.", file=file, hint=hint)
+    apart = float((first.vertices().mean(0) - second.vertices().mean(0)) @ y)
+    if apart < 0 or (apart == 0 and sum(first.limits) < 0):
+        y = -y
+    across = y * [1.0, 1.0, 0.0]
+    return np.asarray(across / np.linalg.norm(across))
 
 
 def _notes(joint: ElementTree.Element, gap: float, mass: float) -> tuple[str, ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from xml.parsers.expat import ExpatError, ParserCreate
@@ -117,26 +117,17 @@ class UrdfReader:
         if not arm:
             raise FormatError("has no moving joint.", file=self.file, field=end, hint="name another link with tip")
         joints: list[Joint] = []
-        placed: dict[str, tuple[int, Array]] = {
-            link: (0, np.eye(4)) for link in self.links if link not in self.joint_to
-        }
-        if len(placed) != 1:
-            raise FormatError(f"has {len(placed)} root links.", file=self.file, hint="a URDF has one")
-        left = dict(self.joint_to)
-        while ready := [child for child, joint in left.items() if self.link(joint, "parent") in placed]:
-            for child in ready:
-                joint = left.pop(child)
-                k, T = placed[self.link(joint, "parent")]
-                T = T @ origin(joint)
-                if joint not in arm:
-                    placed[child] = (k, T @ self._fixed(joint))
-                    continue
-                turn = np.eye(4)
-                turn[:3, :3] = z_to(self.axis(joint))
-                joints.append(self._joint(joint, T @ turn))
-                placed[child] = (k + 1, turn.T)
-        if left:
-            raise FormatError("has links in a circle.", file=self.file, field=next(iter(left)), hint="a URDF is a tree")
+        placed: dict[str, tuple[int, Array]] = {self.root_link(): (0, np.eye(4))}
+        for child, e in self.outwards():
+            k, T = placed[self.link(e, "parent")]
+            T = T @ origin(e)
+            if e not in arm:
+                placed[child] = (k, T @ self._fixed(e))
+                continue
+            turn = np.eye(4)
+            turn[:3, :3] = z_to(self.axis(e))
+            joints.append(self._joint(e, T @ turn))
+            placed[child] = (k + 1, turn.T)
         shapes = distinct(shape for link, (k, T) in placed.items() for shape in self.shapes(link, k, T))
         slack = checked_slack(shapes, joints, placed[end][1], self.slack, self.file)
         lower, upper = np.array([j.lower for j in joints]), np.array([j.upper for j in joints])
@@ -150,6 +141,31 @@ class UrdfReader:
             slack=slack,
         )
         return Reading(robot, tuple(self.notes))
+
+    def root_link(self) -> str:
+        """Return the link that no joint moves.
+
+        Raises:
+            FormatError: there are none or several.
+        """
+        roots = [link for link in self.links if link not in self.joint_to]
+        if len(roots) != 1:
+            raise FormatError(f"has {len(roots)} root links.", file=self.file, hint="a URDF has one")
+        return roots[0]
+
+    def outwards(self) -> Iterator[tuple[str, ElementTree.Element]]:
+        """Yield each link with the joint to it, parents before their children.
+
+        Raises:
+            FormatError: links form a circle.
+        """
+        placed, left = {self.root_link()}, dict(self.joint_to)
+        while ready := [child for child, joint in left.items() if self.link(joint, "parent") in placed]:
+            for child in ready:
+                placed.add(child)
+                yield child, left.pop(child)
+        if left:
+            raise FormatError("has links in a circle.", file=self.file, field=next(iter(left)), hint="a URDF is a tree")
 
     def _path(self, link: str) -> list[ElementTree.Element]:
         found: list[ElementTree.Element] = []

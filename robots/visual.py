@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import zipfile
+import zlib
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -56,7 +58,7 @@ def save_visual(meshes: Iterable[Mesh], path: Path) -> None:
     stored: dict[str, np.ndarray] = {}
     for mesh in meshes:
         stored[f"{mesh.link}"] = np.rint(mesh.vertices / STEP).astype(np.int32)
-        stored[f"{mesh.link}/faces"] = mesh.faces.astype(np.uint16)
+        stored[f"{mesh.link}/faces"] = mesh.faces.astype(np.uint32)
     with atomic_write(path) as file:
         np.savez_compressed(file, allow_pickle=False, **stored)
 
@@ -79,6 +81,6 @@ def load_visual(path: Path, links: int) -> tuple[Mesh, ...]:
                 if not 0 <= int(name) < links or (faces.size and faces.max() >= len(vertices)):
                     raise ValueError(f"link {name}")
                 found.append(Mesh(int(name), vertices.reshape(-1, 3), faces.reshape(-1, 3), closed=False))
-    except (OSError, ValueError, KeyError, EOFError) as error:
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise FormatError(f"holds no meshes ({error}).", file=path, hint="add the robot again") from error
     return tuple(found)

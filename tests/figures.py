@@ -12,7 +12,6 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import yaml
 
@@ -27,7 +26,6 @@ class Figure:
 
     Args:
         doc: path of the document.
-        command: prints the value.
         text: of the document, with {} in place of the value.
         value: as the document has it.
         pattern: finds the value in the output.
@@ -35,7 +33,6 @@ class Figure:
     """
 
     doc: str
-    command: str
     text: str
     value: float | int
     pattern: str
@@ -55,8 +52,7 @@ class Figure:
 def figures() -> Iterator[tuple[str, list[Figure]]]:
     """Return the commands and their figures."""
     for entry in yaml.safe_load(FIGURES.read_text()):
-        about: dict[str, Any] = {"doc": entry["doc"], "command": entry["command"]}
-        yield entry["command"], [Figure(**about, **figure) for figure in entry["figures"]]
+        yield entry["command"], [Figure(entry["doc"], **figure) for figure in entry["figures"]]
 
 
 def expanded(command: str, runs: Path, out: Path) -> list[str]:

@@ -9,9 +9,7 @@ from typing import TextIO
 
 
 def print_message(kind: str, text: object, file: TextIO | None = None) -> None:
-    """Print ``kind: text``: one line in a file; at a terminal, lines that fit it.
-
-    Paths and other long words are not broken, so that they can be copied.
+    """Print ``kind: text``; see :func:`fitted`.
 
     Args:
         kind: "error", "warning" or "question".
@@ -19,11 +17,16 @@ def print_message(kind: str, text: object, file: TextIO | None = None) -> None:
         file: the stream; stderr by default.
     """
     stream = file or sys.stderr
-    message = f"{kind}: {text}"
-    if stream.isatty():
-        columns = shutil.get_terminal_size().columns
-        message = "\n".join(
-            textwrap.fill(line, columns, break_long_words=False, break_on_hyphens=False)
-            for line in message.splitlines()
-        )
-    print(message, file=stream)
+    for line in f"{kind}: {text}".splitlines():
+        print("\n".join(fitted(line, stream)), file=stream)
+
+
+def fitted(text: str, stream: TextIO, indent: int = 0) -> list[str]:
+    """Return the lines of a text: one in a file; at a terminal, lines that fit it after an indent [characters].
+
+    Paths and other long words are not broken, so that they can be copied.
+    """
+    if not stream.isatty():
+        return [text]
+    room = max(shutil.get_terminal_size().columns - indent, 20)
+    return textwrap.wrap(text, room, break_long_words=False, break_on_hyphens=False) or [""]

@@ -181,6 +181,9 @@ def _add(
     stored = str(path) in ARMS and not path.exists()
     if stored and hand is None:
         raise InputError("is shipped.", field=str(path), hint="attach a hand with --gripper, or give a file")
+    for option, value in (("--tip", tip), ("--slack", slack)):
+        if stored and value is not None:
+            raise InputError("is fixed for a shipped arm.", field=option, hint="leave it out")
     if stored:
         arm = load_robot(str(path))
     else:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import shutil
 import sys
-import textwrap
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
+
+from splatbot.cli.messages import fitted
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -21,7 +21,7 @@ def print_table(rows: Sequence[tuple[str, str]], *, title: str | None = None) ->
         print(title)
     width = max((len(name) for name, _ in rows), default=0)
     for name, value in rows:
-        first, *rest = _wrapped(value, width + 4)
+        first, *rest = fitted(value, sys.stdout, width + 4)
         print(f"  {name:<{width}}  {first}")
         for line in rest:
             print(f"  {'':<{width}}  {line}")
@@ -29,15 +29,7 @@ def print_table(rows: Sequence[tuple[str, str]], *, title: str | None = None) ->
 
 def print_text(text: str) -> None:
     """Print a paragraph: one line in a file; at a terminal, lines that fit it."""
-    print("\n".join(_wrapped(text, 0)))
-
-
-def _wrapped(value: str, indent: int) -> list[str]:
-    """Return the lines of a value; paths and other long words are not broken, so that they can be copied."""
-    if not sys.stdout.isatty():
-        return [value]
-    room = max(shutil.get_terminal_size().columns - indent, 20)
-    return textwrap.wrap(value, room, break_long_words=False, break_on_hyphens=False) or [""]
+    print("\n".join(fitted(text, sys.stdout)))
 
 
 def wide_console() -> Console:

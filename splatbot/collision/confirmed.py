@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -119,6 +119,7 @@ def confirmed_near(
     spacing: float,
     most: int,
     agreeing_views: int = CONSTANTS.agreeing_views,
+    inside: Callable[[Array], NDArray[np.bool_]] | None = None,
 ) -> Array:
     """Find the confirmed surface points (S, 3) [m, world] of a box, from all pixels that measure in it.
 
@@ -131,6 +132,7 @@ def confirmed_near(
         spacing: edge of the voxels in which each view proposes at most one point [m].
         most: largest number of proposed points, evenly spaced among all; it bounds the work.
         agreeing_views: number of other views that confirm a surface point.
+        inside: selects the points (P, 3) [m, world] of a smaller volume in the box. If None, all of them.
     """
     found, owners = [np.zeros((0, 3))], [np.zeros(0, np.int64)]
     for number, (depth, camera, T_world_camera) in enumerate(views):
@@ -140,6 +142,8 @@ def confirmed_near(
         z = part[row, column].astype(np.float64)
         points = _lifted(column + columns.start, row + rows.start, z, camera, T_world_camera)
         points = points[((points > low) & (points < high)).all(axis=1)]
+        if inside is not None:
+            points = points[inside(points)]
         cell = np.floor((points - low) / spacing).astype(np.int64) @ [1, 1 << 20, 1 << 40]
         first = np.unique(cell, return_index=True)[1]
         found.append(points[np.sort(first)])

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from splatbot.collision.confirmed import confirmed_near
 from splatbot.collision.visibility import DepthView
-from splatbot.geometry import transform_points
+from splatbot.geometry import inverse, transform_points
 from splatbot.grasping.hands import Hands
 from splatbot.protocols import Array, HandShape
 
@@ -79,18 +79,31 @@ class RawDepth:
         )
 
     def along_approach(self, hands: Hands, hand: HandShape, retreat: float) -> Array:
-        """Return the confirmed surface points (S, 3) [m, world] in a box around one hand and its approach, densely.
+        """Return the confirmed surface points (S, 3) [m, world] in one hand and on its approach, densely.
+
+        The volume is that of :func:`hand_penetration`, with the space between the fingers and that of measured
+        contacts. It is nearly empty for a hand that fits, so that all its pixels can be confirmed.
 
         Args:
             hands: one hand.
             hand: shape of the hand.
             retreat: length of the straight approach [m].
         """
-        x = max(hand.width, hand.palm_size[0]) / 2
-        y = max(hands.opening[0] / 2 + hand.thickness, hand.palm_size[1] / 2)
+        beyond = CONSTANTS.contact_distance
+        x, y = hand.width / 2 + beyond, hands.opening[0] / 2 + hand.thickness + beyond
+        rear, tip = -hand.palm - retreat, hand.tip + beyond
+        sides = np.array([max(x, hand.palm_size[0] / 2), max(y, hand.palm_size[1] / 2)])
         signs = [(sx, sy) for sx in (-1, 1) for sy in (-1, 1)]
-        corners = np.array([[sx * x, sy * y, z] for sx, sy in signs for z in (-hand.palm - retreat, hand.tip)])
+        corners = np.array([[sx * sides[0], sy * sides[1], z] for sx, sy in signs for z in (rear, tip)])
         at = transform_points(hands.T[0], corners)
+        T_hand_world = inverse(hands.T[0])
+
+        def inside(points: Array) -> NDArray[np.bool_]:
+            px, py, pz = transform_points(T_hand_world, points).T
+            px, py = np.abs(px), np.abs(py)
+            palm = (px < hand.palm_size[0] / 2) & (py < hand.palm_size[1] / 2) & (pz < -hand.palm)
+            return np.asarray((pz > rear) & (palm | ((px < x) & (py < y) & (pz < tip))))
+
         return confirmed_near(
             self.views,
             at.min(axis=0),
@@ -99,6 +112,7 @@ class RawDepth:
             quad=self.quad,
             spacing=CONSTANTS.fine_spacing,
             most=CONSTANTS.max_points,
+            inside=inside,
         )
 
 

@@ -18,6 +18,6 @@ def test_a_figure_is_in_its_document(figure: Figure) -> None:
 
 
 def test_a_value_is_found_in_the_output_of_its_command() -> None:
-    figure = Figure("README.md", "splatbot eval RUN", "{}", 0.5, r"ATE RMSE +(\S+) mm", 0.1)
+    figure = Figure("README.md", "{}", 0.5, r"ATE RMSE +(\S+) mm", 0.1)
     assert figure.measured("  ATE RMSE               0.45 mm  over 48 frames") == 0.45
     assert figure.measured("nothing") is None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -117,6 +118,26 @@ def test_confirmed_points_are_on_the_surface_and_dense() -> None:
     assert np.abs(BOX.distance(top)).max() < 1e-9
     assert contact_distances(top, points).max() < 0.003
     assert len(confirmed_near(views(TABLE, BOX), low, high, floor=FLOOR, quad=QUAD, spacing=0.002, most=500)) <= 500
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_dense_check_finds_the_deepest_of_all_pixels_however_many_the_surroundings_have(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert HAND is not None
+    rng = np.random.default_rng(seed)
+    depth, retreat = everything(), 0.1
+    T = np.diag([1.0, -1.0, -1.0, 1.0])  # downwards
+    T[:3, 3] = [0.45 + rng.uniform(-0.03, 0.03), 0.1 + rng.uniform(-0.03, 0.03), 0.115]
+    one = Hands.one(T, 0.06)
+    corners = np.array([[0.25, -0.1, 0.0], [0.65, 0.3, 0.4]])
+    every = confirmed_near(depth.views, *corners, floor=FLOOR, quad=QUAD, spacing=1e-5, most=10**7)
+    deepest = float(hand_penetration(one, every, HAND, retreat=retreat)[0])
+    assert deepest > CONSTANTS.max_penetration
+    few = len(depth.along_approach(one, HAND, retreat))
+    monkeypatch.setattr("splatbot.grasping.measured.CONSTANTS", replace(CONSTANTS, max_points=few * 4))
+    found = hand_penetration(one, depth.along_approach(one, HAND, retreat), HAND, retreat=retreat)
+    assert deepest - 1.5e-3 <= found[0] <= deepest + 1e-6
 
 
 def test_two_frames_confirm_nothing() -> None:

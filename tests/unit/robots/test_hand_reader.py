@@ -153,6 +153,9 @@ def test_a_shipped_arm_gets_a_gripper_of_the_user(
     assert T[2, 3] == pytest.approx(0.05)
     assert main(["robot", "add", "ur5e", "--name", "other"]) == 2
     assert "attach a hand with --gripper" in capsys.readouterr().err
+    words = ["robot", "add", "ur5e", "--gripper", "2f85", "--name", "other", "--slack", "0.01"]
+    assert main(words) == 2
+    assert "--slack: is fixed for a shipped arm" in capsys.readouterr().err
 
 
 def test_a_gripper_that_does_not_exist_is_refused_before_the_arm_is_read(tmp_path: Path) -> None:
