@@ -146,7 +146,7 @@ class UrdfReader:
         """Return the link that no joint moves.
 
         Raises:
-            FormatError: there are none or several.
+            FormatError: there is not exactly one.
         """
         roots = [link for link in self.links if link not in self.joint_to]
         if len(roots) != 1:
