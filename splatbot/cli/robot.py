@@ -170,6 +170,7 @@ def _add(
     from splatbot.robots.hands import Hand, attach, find_hand
     from splatbot.robots.reading import simplified
     from splatbot.robots.store import load_robot, robot_file, save_robot
+    from splatbot.robots.visual import visual_meshes
 
     hand: Hand | None = None
     notes: tuple[str, ...] = ()
@@ -202,7 +203,8 @@ def _add(
         )
         arm = simplified(arm, slack is None)
     if hand is not None:
-        arm = replace(attach(arm, hand), name=arm.name)
+        bare, arm = arm, replace(attach(arm, hand), name=arm.name)
+        arm = replace(arm, visual=visual_meshes([*bare.visual, *arm.shapes[len(bare.shapes) :]]))
     beyond = uncovered(arm.shapes, arm.spheres())
     save_robot(arm, file)
     inside = beyond <= 1e-9

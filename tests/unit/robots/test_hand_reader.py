@@ -149,6 +149,9 @@ def test_a_shipped_arm_gets_a_gripper_of_the_user(
     assert robot.hand is not None
     assert robot.hand.stroke == pytest.approx(0.07)
     np.testing.assert_array_equal(robot.chain.upper, arm.chain.upper)
+    drawn = np.concatenate([mesh.vertices for mesh in robot.visual if mesh.link == len(robot)])
+    palm = transform_points(arm.T_link_tcp, np.array([[0.03, 0.06, 0.0], [-0.03, -0.06, 0.02]]))
+    assert np.linalg.norm(drawn - palm[:, None], axis=2).min(axis=1).max() < 1e-3  # pictures show the palm
     T = inverse(arm.T_link_tcp) @ robot.T_link_tcp
     assert T[2, 3] == pytest.approx(0.05)
     assert main(["robot", "add", "ur5e", "--name", "other"]) == 2
