@@ -42,6 +42,8 @@ class GraspSearchConstants:
         max_hands_target: maximum number of hands that are checked against the target.
         max_hands_map: maximum number of hands that are checked against the map.
         max_hands_arm: maximum number of hands whose reachability is checked.
+        back_off: [m] way back on the approach of a hand that all measured depth, but no sample of it, rejects. It is
+            smaller than the step between the depths of hands.
         early_penetration: [m] accepted penetration of fingers into the map before their final opening is known.
         min_top_cosine: minimum cosine between approach direction and down for a top approach.
         min_down_cosine: minimum cosine between approach direction and down for any approach.
@@ -52,6 +54,7 @@ class GraspSearchConstants:
     max_hands_target: int = 2000
     max_hands_map: int = 200
     max_hands_arm: int = 60
+    back_off: float = 1e-3
     early_penetration: float = 0.003
     min_top_cosine: float = float(np.cos(np.radians(40.0)))
     min_down_cosine: float = -0.26
@@ -65,6 +68,7 @@ _IN_TARGET = "hands are in the target on their way"
 _IN_MAP = "hands touch the surroundings of the target"
 _UNEVEN = "hands have something that stands out under a pad"
 _IN_DEPTH = "hands are in measured depth"
+_DEEP = "are in measured depth"  # the kind of a rejection by the dense check
 
 
 @dataclass(eq=False)
@@ -331,12 +335,20 @@ class Search:
         for grasp in grasps:
             if wanted == 0:
                 break
-            judged, kind = (grasp, "") if reach is None else self._with_arm(grasp, reach)
-            if not judged.rejected and self.s.raw is not None:
-                judged, kind = self._at_full_density(judged, self.s.raw)
+            judged, kind = self._judged(grasp, reach)
+            if kind == _DEEP:
+                back = self._judged(_backed_off(grasp), reach)
+                judged, kind = back if not back[0].rejected else (judged, kind)
             checked.append((judged, kind))
             wanted -= not checked[-1][0].rejected
         return checked
+
+    def _judged(self, grasp: Grasp, reach: ReachabilityCheck | None) -> tuple[Grasp, str]:
+        """Check a grasp with the arm and with all measured depth; return it with the kind of its rejection."""
+        judged, kind = (grasp, "") if reach is None else self._with_arm(grasp, reach)
+        if not judged.rejected and self.s.raw is not None:
+            return self._at_full_density(judged, self.s.raw)
+        return judged, kind
 
     def _with_arm(self, grasp: Grasp, reach: ReachabilityCheck) -> tuple[Grasp, str]:
         reached = reach.reach(grasp.T_world_tcp, grasp.T_world_pregrasp, grasp.opening)
@@ -358,7 +370,7 @@ class Search:
             float(hand_penetration(Hands.one(grasp.T_world_tcp, width), points, self.s.hand, retreat=0.0)[0]),
         )
         if deep > MEASURED.max_penetration:
-            return replace(grasp, rejected=f"is {1e3 * deep:.1f} mm deep in measured depth"), "are in measured depth"
+            return replace(grasp, rejected=f"is {1e3 * deep:.1f} mm deep in measured depth"), _DEEP
         assert grasp.depth_distance is not None
         away = np.minimum(grasp.depth_distance, contact_distances(grasp.contacts, points))
         measured = float((away <= MEASURED.contact_distance).mean())
@@ -472,3 +484,13 @@ def _deep(clearance: float) -> str:
 def _exposed(grasp: Grasp) -> Grasp:
     """Return a grasp with the score term 0 for crossing a region where motion was observed."""
     return replace(grasp, terms={**grasp.terms, "clear": 0.0})
+
+
+def _backed_off(grasp: Grasp) -> Grasp:
+    """Return a grasp 1 mm farther back on its approach, where its hand passes anyway.
+
+    The dense check finds points that the search did not sample, often those under the finger tips.
+    """
+    T = grasp.T_world_tcp.copy()
+    T[:3, 3] -= CONSTANTS.back_off * T[:3, 2]
+    return replace(grasp, T_world_tcp=T)

@@ -140,6 +140,19 @@ def test_the_dense_check_finds_the_deepest_of_all_pixels_however_many_the_surrou
     assert deepest - 1.5e-3 <= found[0] <= deepest + 1e-6
 
 
+def test_grasps_lie_on_their_approach_and_no_measured_point_is_too_deep_in_them() -> None:
+    assert HAND is not None
+    depth = everything()
+    for grasp in grasps_with(depth).grasps:
+        way = grasp.T_world_tcp[:3, 3] - grasp.T_world_pregrasp[:3, 3]
+        along = float(way @ grasp.T_world_tcp[:3, 2])
+        np.testing.assert_allclose(way, along * grasp.T_world_tcp[:3, 2], atol=1e-9)
+        assert along == pytest.approx(GraspOptions().pregrasp, abs=1.1e-3)
+        one = Hands.one(grasp.T_world_tcp, grasp.opening)
+        points = depth.along_approach(one, HAND, along)
+        assert hand_penetration(one, points, HAND, retreat=along)[0] <= CONSTANTS.max_penetration
+
+
 def test_two_frames_confirm_nothing() -> None:
     pair = raw(TABLE, BOX, turns=np.array([0.0, 0.3]))
     assert HAND is not None
