@@ -119,6 +119,7 @@ def confirmed_near(
     spacing: float,
     most: int,
     agreeing_views: int = CONSTANTS.agreeing_views,
+    T_world_box: Array | None = None,
     inside: Callable[[Array], NDArray[np.bool_]] | None = None,
 ) -> Array:
     """Find the confirmed surface points (S, 3) [m, world] of a box, from all pixels that measure in it.
@@ -127,26 +128,27 @@ def confirmed_near(
 
     Args:
         views: depth (H, W) [m], 0 or NaN where invalid, camera, and T_world_camera (4, 4) of each view.
-        low, high: (3,) corners of the box [m, world].
+        low, high: (3,) corners of the box in its frame [m].
         floor, quad: σ = ``floor`` + ``quad`` z² of depth, in [m] and [1/m].
         spacing: edge of the voxels in which each view proposes at most one point [m].
         most: largest number of proposed points, evenly spaced among all; it bounds the work.
         agreeing_views: number of other views that confirm a surface point.
-        inside: selects the points (P, 3) [m, world] of a smaller volume in the box. If None, all of them.
+        T_world_box: (4, 4) frame of the box. If None, the world.
+        inside: selects the points (P, 3) [m, frame of the box] of a smaller volume in the box. If None, all of them.
     """
+    T = np.eye(4) if T_world_box is None else T_world_box
     found, owners = [np.zeros((0, 3))], [np.zeros(0, np.int64)]
     for number, (depth, camera, T_world_camera) in enumerate(views):
-        columns, rows = _pixel_window(low, high, camera, T_world_camera)
-        part = depth[rows, columns]
-        row, column = np.nonzero(np.isfinite(part) & (part > 0))
-        z = part[row, column].astype(np.float64)
-        points = _lifted(column + columns.start, row + rows.start, z, camera, T_world_camera)
-        points = points[((points > low) & (points < high)).all(axis=1)]
+        row, column = _pixels_in_box(depth, low, high, camera, inverse(T) @ T_world_camera)
+        z = depth[row, column].astype(np.float64)
+        local = _lifted(column, row, z, camera, inverse(T) @ T_world_camera)
+        chosen = ((local > low) & (local < high)).all(axis=1)
         if inside is not None:
-            points = points[inside(points)]
-        cell = np.floor((points - low) / spacing).astype(np.int64) @ [1, 1 << 20, 1 << 40]
+            chosen[chosen] = inside(local[chosen])
+        local = local[chosen]
+        cell = np.floor((local - low) / spacing).astype(np.int64) @ [1, 1 << 20, 1 << 40]
         first = np.unique(cell, return_index=True)[1]
-        found.append(points[np.sort(first)])
+        found.append(transform_points(T, local[np.sort(first)]))
         owners.append(np.full(len(first), number))
     proposed, owner = np.concatenate(found), np.concatenate(owners)
     some = np.linspace(0, len(proposed) - 1, min(most, len(proposed))).round().astype(np.int64)
@@ -154,10 +156,32 @@ def confirmed_near(
     return np.asarray(proposed[some][clear & (agreeing >= agreeing_views)])
 
 
-def _pixel_window(low: Array, high: Array, camera: Camera, T_world_camera: Array) -> tuple[slice, slice]:
+def _pixels_in_box(
+    depth: NDArray[np.float32], low: Array, high: Array, camera: Camera, T_box_camera: Array
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return rows and columns of the pixels that measure in a box, or within 0.1 mm of it.
+
+    A pixel (u, v) with depth z lies at z (a u + b v + c) + t in the frame of the box, so that one axis of all pixels
+    is computed from a row and a column, in float32.
+    """
+    columns, rows = _pixel_window(low, high, camera, T_box_camera)
+    part = depth[rows, columns]
+    x = (np.arange(columns.start, columns.stop) - camera.cx) / camera.fx
+    y = (np.arange(rows.start, rows.stop) - camera.cy) / camera.fy
+    within = part > 0
+    for axis in range(3):
+        a, b, c, t = T_box_camera[axis]
+        direction = (a * x).astype(np.float32)[None] + (b * y + c).astype(np.float32)[:, None]
+        p = part * direction
+        within &= (p > np.float32(low[axis] - t - 1e-4)) & (p < np.float32(high[axis] - t + 1e-4))
+    row, column = np.nonzero(within)
+    return row + rows.start, column + columns.start
+
+
+def _pixel_window(low: Array, high: Array, camera: Camera, T_box_camera: Array) -> tuple[slice, slice]:
     """Return the columns and rows of an image that can show a box; all of them if the box reaches the camera."""
     corners = np.array([[(low, high)[bit][axis] for axis, bit in enumerate(bits)] for bits in np.ndindex(2, 2, 2)])
-    p = transform_points(inverse(T_world_camera), corners)
+    p = transform_points(inverse(T_box_camera), corners)
     if (p[:, 2] < 0.05).all():
         return slice(0, 0), slice(0, 0)
     if (p[:, 2] < 0.05).any():

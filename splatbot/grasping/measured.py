@@ -11,7 +11,6 @@ from scipy.spatial import cKDTree
 
 from splatbot.collision.confirmed import confirmed_near
 from splatbot.collision.visibility import DepthView
-from splatbot.geometry import inverse, transform_points
 from splatbot.grasping.hands import Hands
 from splatbot.protocols import Array, HandShape
 
@@ -92,26 +91,22 @@ class RawDepth:
         beyond = CONSTANTS.contact_distance
         x, y = hand.width / 2 + beyond, hands.opening[0] / 2 + hand.thickness + beyond
         rear, tip = -hand.palm - retreat, hand.tip + beyond
-        sides = np.array([max(x, hand.palm_size[0] / 2), max(y, hand.palm_size[1] / 2)])
-        signs = [(sx, sy) for sx in (-1, 1) for sy in (-1, 1)]
-        corners = np.array([[sx * sides[0], sy * sides[1], z] for sx, sy in signs for z in (rear, tip)])
-        at = transform_points(hands.T[0], corners)
-        T_hand_world = inverse(hands.T[0])
+        sides = (max(x, hand.palm_size[0] / 2), max(y, hand.palm_size[1] / 2))
 
         def inside(points: Array) -> NDArray[np.bool_]:
-            px, py, pz = transform_points(T_hand_world, points).T
-            px, py = np.abs(px), np.abs(py)
+            px, py, pz = np.abs(points[:, 0]), np.abs(points[:, 1]), points[:, 2]
             palm = (px < hand.palm_size[0] / 2) & (py < hand.palm_size[1] / 2) & (pz < -hand.palm)
-            return np.asarray((pz > rear) & (palm | ((px < x) & (py < y) & (pz < tip))))
+            return np.asarray(palm | ((px < x) & (py < y)))
 
         return confirmed_near(
             self.views,
-            at.min(axis=0),
-            at.max(axis=0),
+            np.array([-sides[0], -sides[1], rear]),
+            np.array([*sides, tip]),
             floor=self.floor,
             quad=self.quad,
             spacing=CONSTANTS.fine_spacing,
             most=CONSTANTS.max_points,
+            T_world_box=hands.T[0],
             inside=inside,
         )
 

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from splatbot.protocols import Array
+from splatbot.segmentation.rectangle import fit_rectangle
 
 
 @dataclass(frozen=True)
@@ -78,8 +79,7 @@ def _heights(points: Array, floor: float) -> tuple[float, float]:
 
 
 def _box(points: Array, low: float, high: float) -> Fit:
-    _, _, degrees = cv2.minAreaRect(points[:, :2].astype(np.float32))
-    yaw = float(np.radians(degrees))
+    yaw = fit_rectangle(points[:, :2]).yaw
     c, s = np.cos(yaw), np.sin(yaw)
     R = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
     q = points @ R

@@ -19,6 +19,7 @@ from splatbot.segmentation.clusters import clusters
 from splatbot.segmentation.concave_edges import split_at_concave_edges
 from splatbot.segmentation.faces import local_normals, nearest_of, region, split_at_steps
 from splatbot.segmentation.plane import NEAR, Support, find_support, given_support
+from splatbot.segmentation.rectangle import fit_rectangle
 from splatbot.workspace import NamedPlace
 
 
@@ -326,10 +327,10 @@ def _with_faint(
 
 
 def _described(number: int, rows: NDArray[np.int64], points: Array, colors: Array, T: Array) -> MapObject:
-    (x, y), sides, _ = cv2.minAreaRect(points[:, :2].astype(np.float32))
+    base = fit_rectangle(points[:, :2])
     low, high = np.percentile(points[:, 2], [1, 99])
-    size = np.array([max(sides), min(sides), high - low])
-    center = transform_points(T, np.array([x, y, (low + high) / 2]))
+    size = np.array([base.sides.max(), base.sides.min(), high - low])
+    center = transform_points(T, np.array([*base.center, (low + high) / 2]))
     return MapObject(number, rows, center, size, np.median(colors, axis=0))
 
 
