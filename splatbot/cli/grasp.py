@@ -89,7 +89,7 @@ def grasp(
         n_sigma: surface of a Gaussian, in standard deviations; smaller than for planning, because the hand comes close.
         min_observations: least number of keyframes that support a Gaussian; others are ignored.
         seed: seed of the search.
-        verbose: without a grasp, print the counts of each reason.
+        verbose: print the terms of the scores; without a grasp, the counts of each reason.
         out: folder to write to; by default runs/grasp.
     """
     places = {"--target": target, "--pixel": pixel, "--point": point, "--box": box, "--mask": mask, "--tag": tag}
@@ -146,7 +146,7 @@ def grasp(
         why = " ".join(note for note in found.notes if note.startswith("took "))
         raise SplatbotError(f"cannot be grasped: {reason}. {why}".strip(), field=found.label, hint=change)
     result.unwrap()
-    _print(result, folder)
+    _print(result, folder, margin=sampler.margin, raw=sampler.raw is not None, verbose=verbose)
     return 0
 
 
@@ -231,7 +231,10 @@ def _view(map_: Path, index: int) -> ObservedView:
     return ObservedView(replace(log.camera, distortion=()), poses[index], log[index].rgb)
 
 
-def _print(result: GraspResult, folder: Path) -> None:
+_HAND = {True: "the hand clears measured depth too", False: "nor for the hand, because there is no run with depth"}
+
+
+def _print(result: GraspResult, folder: Path, *, margin: float, raw: bool, verbose: bool) -> None:
     from rich.table import Table
 
     from splatbot.cli.tables import print_columns, print_table, print_text
@@ -242,21 +245,26 @@ def _print(result: GraspResult, folder: Path) -> None:
         ("target", f"{target.label}, {len(target.rows)} Gaussians, by {target.backend} ({target.score:.2f})"),
         ("candidates", f"{result.candidates} hands in {1e3 * seconds:.0f} ms"),
         *(("note", note) for note in (*target.notes, *result.notes)),
-        ("written to", str(folder)),
+        (
+            "margin",
+            f"{1e3 * margin:.1f} mm" if margin else "0: the map's errors are not covered for the arm; " + _HAND[raw],
+        ),
+        ("written to", f"{folder}: grasp.json has poses, joint values and terms; grasp.png shows the first"),
     ]
     print_table(rows, title="grasps")
-    terms = list(result.grasps[0].terms)
+    terms = list(result.grasps[0].terms) if verbose else []
     contacts = ["contacts"] if result.grasps[0].implied else []
     table = Table()
-    for name in ("", "total", "confidence", "approach", "width, mm", "opens, mm", "clearance, mm", *contacts, *terms):
-        table.add_column(name, justify="left" if name == "approach" else "right")
+    for name in ("", "total", "conf.", "from", "width", "opens", "clear", *contacts, *terms):
+        table.add_column(name, justify="left" if name == "from" else "right")
     for k, g in enumerate(result.grasps):
         lengths = (f"{1e3 * value:.1f}" for value in (g.width, g.opening, g.clearance))
         contact = [" and ".join("implied" if each else "measured" for each in g.implied)] if contacts else []
         values = (f"{g.terms[name]:.2f}" for name in terms)
         table.add_row(str(k), f"{g.total:.3f}", f"{g.confidence:.2f}", g.approach, *lengths, *contact, *values)
     print_columns(table)
-    print_text("the best total and the best value of a term is 1")
-    print_text("confidence: share of such grasps that succeeded in simulation; errors of the map are not in it")
+    print_text("width of the closed hand, opening on the approach, and clearance from the surroundings, in mm")
+    print_text("the best total is 1; --verbose prints its terms, of which the best value is 1")
+    print_text("conf.: share of such grasps that succeeded in simulation; errors of the map are not in it")
     if contacts:
         print_text("a measured contact is within 3 mm of depth that three frames agree on; an implied one is not")

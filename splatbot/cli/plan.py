@@ -10,7 +10,7 @@ import tyro
 
 from splatbot.cli.paths import check_output
 from splatbot.cli.placing import Pose, base_pose, checked_pose, margin_value, run_folder
-from splatbot.errors import InputError
+from splatbot.errors import InputError, SplatbotError
 from splatbot.layouts import map_file
 
 if TYPE_CHECKING:
@@ -101,12 +101,18 @@ def plan(
         if goal_pose is not None
         else _joints(goal or (), arm, "--goal")
     )
-    solids = _unknown_solids(map, unknown, arm, T_world_base, here)
-    field = GaussianCollisionField(GaussianModel.concatenate([model, solids]) if len(solids) else model, n_sigma)
+    of_map = GaussianCollisionField(model, n_sigma)
+    unknown_at = _unknown_solids(map, unknown, arm, T_world_base, here)
+
+    def make_planner(keep: float) -> GaussianRRTStar:
+        solids = unknown_at(keep)
+        everything = GaussianCollisionField(GaussianModel.concatenate([model, solids]), n_sigma) if solids else of_map
+        return GaussianRRTStar(everything, arm, T_world_base=T_world_base, margin=keep)
+
     found = _plan(
         map,
-        GaussianCollisionField(model, n_sigma),
-        lambda keep: GaussianRRTStar(field, arm, T_world_base=T_world_base, margin=keep),
+        of_map,
+        make_planner,
         lambda planner: planner.plan(here, wanted, budget_ms=budget_ms, seed=seed),
         here if goal_pose is not None else np.stack([here, wanted]),
         margin="auto" if margin is None and map.is_dir() else margin or "0",
@@ -114,17 +120,18 @@ def plan(
         speed=speed,
     )
     result, trajectory = found.result, found.trajectory
+    _refuse_unknown(result, len(model))
     result.unwrap()
     assert trajectory is not None
     covers = found.scope(n_sigma=n_sigma, unknown=unknown, confidence=confidence)
     folder = out if out is not None else Path("runs") / "plan"
     title = f"{arm.name} in {map.resolve().name}"
     texts = {
-        "plan.json": json.dumps(_summary(result, trajectory) | {"covers": covers}, indent=2),
+        "plan.json": json.dumps(_summary(arm, T_world_base, result, trajectory) | {"covers": covers}, indent=2),
         "trajectory.json": trajectory.to_json(),
         "trajectory.csv": trajectory.to_csv(),
         "plan.html": plan_html(
-            model, found.planner.arm, field, trajectory, coarse_appearance(arm), arm.fk, title=title
+            model, found.planner.arm, found.planner.field, trajectory, coarse_appearance(arm), arm.fk, title=title
         ),
     }
     writers = {name: write_text(text) for name, text in texts.items()}
@@ -136,18 +143,30 @@ def plan(
 
 def _unknown_solids(
     map_: Path, policy: UnknownPolicy, arm: RobotModel, T_world_base: NDArray[np.float64], here: NDArray[np.float64]
-) -> GaussianModel:
-    """Return the unknown space of a run as Gaussians; none if it counts as free."""
+) -> Callable[[float], GaussianModel | None]:
+    """Return a function of the margin [m] that gives the unknown space of a run as Gaussians, None if it is free."""
     from splatbot.collision import RobotSpheres
-    from splatbot.gaussians import GaussianModel
     from splatbot.results.unknown import obstacles, unknown_in_reach
     from splatbot.robots.in_view import reopen_log
 
     if policy == "free":
-        return GaussianModel.empty()
+        return lambda margin: None
     run = run_folder(map_, "--unknown")
     spheres = RobotSpheres(arm, T_world_base=T_world_base)
-    return obstacles(unknown_in_reach(run, reopen_log(run), spheres), policy, spheres, here)
+    space = unknown_in_reach(run, reopen_log(run), spheres)
+    return lambda margin: obstacles(space, policy, spheres, here, margin=margin) or None
+
+
+def _refuse_unknown(result: PlanResult, gaussians: int) -> None:
+    """Raise an error if unknown space, which follows the map's Gaussians, makes a start or goal invalid."""
+    cause = result.cause
+    if result.path is not None or cause is None or cause.gaussian < gaussians:
+        return
+    raise SplatbotError(
+        f"link {cause.link} is {1e3 * cause.depth:.1f} mm deep in space that no frame saw to be empty.",
+        field=result.status.name.lower(),
+        hint="map the place from more views, give another goal, or plan with --unknown free",
+    )
 
 
 def _plan(
@@ -189,10 +208,20 @@ def _joints(words: tuple[str, ...], robot: RobotModel, flag: str) -> NDArray[np.
     return values
 
 
-def _summary(result: PlanResult, trajectory: JointTrajectory) -> dict[str, Any]:
+def _summary(
+    arm: RobotModel, T_world_base: NDArray[np.float64], result: PlanResult, trajectory: JointTrajectory
+) -> dict[str, Any]:
+    from splatbot.geometry import rotation_to_quat
+
     assert result.path is not None
     c = trajectory.certificate
     return {
+        "robot": arm.name,
+        "joint_names": list(trajectory.names),
+        "T_world_base": {
+            "translation": T_world_base[:3, 3].tolist(),
+            "quaternion_wxyz": rotation_to_quat(T_world_base[:3, :3]).tolist(),
+        },
         "status": result.status.name,
         "code": int(result.status),
         "cost_rad": result.path.cost,
@@ -207,6 +236,7 @@ def _summary(result: PlanResult, trajectory: JointTrajectory) -> dict[str, Any]:
     }
 
 
+_BASE_IN_MAP = "NOT COVERED, AND PROBABLY WRONG: the mounted link stands in the map by more than its foot; check --base"
 _UNKNOWN = {
     "free": "not covered: counts as free",
     "cautious": "covered where two frames looked and measured no depth",
@@ -216,6 +246,7 @@ _UNKNOWN = {
 
 def _print(result: PlanResult, trajectory: JointTrajectory, covers: dict[str, Any], folder: Path) -> None:
     from splatbot.cli.tables import print_table
+    from splatbot.planning.timing import clearance_text
 
     assert result.path is not None
     c = trajectory.certificate
@@ -224,9 +255,9 @@ def _print(result: PlanResult, trajectory: JointTrajectory, covers: dict[str, An
         ("length", f"{result.path.cost:.3f} rad, {len(result.path)} waypoints"),
         ("duration", f"{trajectory.duration:.3f} s"),
         ("certified", "yes" if c.certified else "NO"),
-        ("clearance", f"at least {1e3 * c.clearance:.1f} mm beyond a margin of {1e3 * c.margin:.1f} mm"),
+        ("clearance", clearance_text(c)),
         ("covers", f"moving links against the map at {covers['n_sigma']:g} sigma and against the arm itself"),
-        ("base", "not covered: the mounted link is not checked against the map"),
+        ("base", _BASE_IN_MAP if covers["base_in_map"] else "not covered: the mounted link is not checked"),
         ("unknown space", _UNKNOWN[covers["unknown_space"]]),
         ("margin", _margin_text(covers)),
         ("written to", str(folder)),

@@ -142,7 +142,7 @@ def confirmed_near(
         row, column = _pixels_in_box(depth, low, high, camera, inverse(T) @ T_world_camera)
         z = depth[row, column].astype(np.float64)
         local = _lifted(column, row, z, camera, inverse(T) @ T_world_camera)
-        chosen = ((local > low) & (local < high)).all(axis=1)
+        chosen = np.asarray(((local > low) & (local < high)).all(axis=1))
         if inside is not None:
             chosen[chosen] = inside(local[chosen])
         local = local[chosen]

@@ -12,6 +12,7 @@ from splatbot._native import ARM_SELF, Arm
 from splatbot.collision.field import GaussianCollisionField
 from splatbot.collision.inputs import rows
 from splatbot.errors import InputError
+from splatbot.geometry import transform_points
 from splatbot.protocols import Array, LinkSpheres, RobotKinematics
 
 EPS = 1e-3  # [m]; an edge on which a sphere has less clearance is not certified
@@ -127,6 +128,18 @@ class RobotSpheres:
         """Compute the poses T_world_link (C, J + 1, 4, 4) at configurations (C, J)."""
         poses: Array = self.native.forward(self._joints(q, "q"))
         return poses
+
+    def base_in_map_above(self, field: GaussianCollisionField, height: float) -> bool:
+        """Return whether the part of the base above a height [m] over its foot may be in the map.
+
+        The base stands on a surface of the map, so that its foot always touches. Each sphere is cut at the height: the
+        largest sphere with the same centre above it is checked.
+        """
+        base = self.spheres.link == 0
+        centers, radii = self.spheres.centers[base], self.spheres.radii[base]
+        cut = np.minimum(radii, centers[:, 2] - height)
+        at = transform_points(self.T_world_base, centers[cut > 0])
+        return bool(field.in_collision(np.c_[at, cut[cut > 0]]).any())
 
     def check(self, field: GaussianCollisionField | None, q: ArrayLike) -> ConfigurationResult:
         """Check whether configurations (C, J) may collide with the map or with themselves.

@@ -170,7 +170,8 @@ def _decided(scene: SegmentedMap, text: str, scores: Array, notes: tuple[str, ..
             candidates=tuple(described[: len(like)]),
         )
     found = scene.objects[best]
-    return Target(found.rows, None, found.name or text, "rules", float(scores[best]), (*notes, *described), best)
+    fitting = (note for note, k in zip(described, order, strict=False) if scores[k] > 0.0)
+    return Target(found.rows, None, found.name or text, "rules", float(scores[best]), (*notes, *fitting), best)
 
 
 def color_name(item: MapObject) -> str:

@@ -16,11 +16,18 @@ from splatbot.geometry import inverse, look_at, transform_points
 from splatbot.grasping.types import Grasp
 from splatbot.protocols import Array
 from splatbot.rasterize.views import to_png
+from splatbot.report.annotations import Color, with_legend, with_scale
 from splatbot.report.robot_drawing import DrawnPart, draw_robot, map_view
 from splatbot.report.sphere_gaussians import sphere_gaussians
 from splatbot.segmentation import SegmentedMap
 
-_CONTACT, _TARGET = np.array([0.1, 0.9, 0.2]), np.array([0.95, 0.5, 0.1])
+_MEASURED, _IMPLIED, _TARGET = (0.1, 0.9, 0.2), (1.0, 0.9, 0.1), (0.95, 0.5, 0.1)
+_LEGEND: list[tuple[str, Color]] = [
+    ("target, as the map has it", _TARGET),
+    ("contact at measured depth, and its normal", _MEASURED),
+    ("implied contact, not measured", _IMPLIED),
+    ("hand at the grasp; paler at the pre-grasp", (0.6, 0.62, 0.65)),
+]
 
 
 @dataclass(frozen=True)
@@ -52,7 +59,7 @@ def grasp_png(
     width: int = 1280,
     height: int = 480,
 ) -> bytes:
-    """Render two views: the tinted target, the hand at grasp and pre-grasp (transparent), and contacts in green.
+    """Render two views: the tinted target, the hand at grasp and pre-grasp (transparent), and contacts.
 
     Args:
         scene: the map.
@@ -66,10 +73,12 @@ def grasp_png(
     middle = grasp.contacts.mean(axis=0)
     near = np.linalg.norm(model.means.double().numpy() - middle, axis=1) < CONSTANTS.crop_radius
     drawn = [model.select(torch.from_numpy(np.flatnonzero(near)))]
-    drawn.append(sphere_gaussians(grasp.contacts, np.full(2, 0.006), _CONTACT, 0.95))
     steps = np.linspace(0.004, 0.03, 8)[:, None]
-    for contact, normal in zip(grasp.contacts, grasp.normals, strict=True):
-        drawn.append(sphere_gaussians(contact + steps * normal, np.full(8, 0.0025), _CONTACT, 0.95))
+    implied = grasp.implied or (False, False)
+    for contact, normal, is_implied in zip(grasp.contacts, grasp.normals, implied, strict=True):
+        color = np.array(_IMPLIED if is_implied else _MEASURED)
+        drawn.append(sphere_gaussians(contact[None], np.full(1, 0.006), color, 0.95))
+        drawn.append(sphere_gaussians(contact + steps * normal, np.full(8, 0.0025), color, 0.95))
     parts = [replace(part, link=0) for part in hand]
     half = width // 2
     camera = Camera(0.9 * half, 0.9 * half, (half - 1) / 2, (height - 1) / 2, half, height)
@@ -80,14 +89,15 @@ def grasp_png(
         view, depth = map_view(GaussianModel.concatenate(drawn), camera, T)
         for T_world_tcp, opacity in ((grasp.T_world_tcp, 1.0), (grasp.T_world_pregrasp, 0.25)):
             draw_robot(view, depth, camera, T, parts, (T_world_tcp @ inverse(T_link_tcp))[None], opacity=opacity)
-        views.append(view)
-    return to_png(np.ascontiguousarray(np.concatenate(views, axis=1)), "rgb")
+        views.append(with_scale(view, camera, CONSTANTS.camera_distance, "at the target"))
+    picture = np.ascontiguousarray(np.concatenate(views, axis=1))
+    return to_png(with_legend(picture, _LEGEND), "rgb")
 
 
 def _tinted(model: GaussianModel, rows: NDArray[np.int64]) -> GaussianModel:
     """Return the map with the target's colours blended towards orange."""
     tinted = model.clone()
     index = torch.from_numpy(rows)
-    colors = 0.55 * model.colors[index] + 0.45 * torch.from_numpy(_TARGET).to(model.means.dtype)
+    colors = 0.55 * model.colors[index] + 0.45 * torch.tensor(_TARGET, dtype=model.means.dtype)
     tinted.sh[index, 0] = rgb_to_sh(colors)
     return tinted

@@ -6,17 +6,16 @@ import colorsys
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from splatbot.camera import Camera
 from splatbot.gaussians.harmonics import rgb_to_sh
 from splatbot.geometry import inverse, look_at, transform_points
 from splatbot.grasping.object_list import ListedObject
-from splatbot.protocols import Array
 from splatbot.rasterize.views import render_view, to_png
+from splatbot.report.annotations import with_legend, with_numbers, with_scale
+from splatbot.report.robot_drawing import BACKGROUND
 from splatbot.segmentation import SegmentedMap
 
 
@@ -41,7 +40,7 @@ CONSTANTS = ObjectsViewConstants()
 
 
 def objects_png(scene: SegmentedMap, found: Sequence[ListedObject], *, width: int = 1280, height: int = 800) -> bytes:
-    """Render the map obliquely from above with each object in its own hue, with its number and label."""
+    """Render the map obliquely from above, each object numbered in its own hue; a legend gives labels and sizes."""
     model = scene.model.clone()
     for item in found:
         index = torch.from_numpy(scene.objects[item.number].rows)
@@ -56,34 +55,22 @@ def objects_png(scene: SegmentedMap, found: Sequence[ListedObject], *, width: in
     T = scene.T_world_base @ look_at(middle + CONSTANTS.distance * radius * side / np.linalg.norm(side), middle)
     camera = Camera(0.95 * width, 0.95 * width, (width - 1) / 2, (height - 1) / 2, width, height)
     shown = model.select(torch.from_numpy(np.flatnonzero(near)))
-    image = render_view(shown, camera, T, background=(0.09, 0.1, 0.12))
-    return to_png(_labelled(image, camera, T, found), "rgb")
+    image = render_view(shown, camera, T, background=BACKGROUND)
+    hues = {item.number: _hue(item.number) for item in found}
+    seen = {item.number: transform_points(inverse(T), item.at_world) for item in found}
+    places = {
+        n: np.array([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy])
+        for n, (x, y, z) in seen.items()
+        if z > 0
+    }
+    image = with_numbers(image, places, hues)
+    image = with_legend(image, [(_described(item), hues[item.number]) for item in found])
+    return to_png(with_scale(image, camera, CONSTANTS.distance * radius, "in the middle"), "rgb")
+
+
+def _described(item: ListedObject) -> str:
+    return f"{item.number}: {item.label}, " + " x ".join(f"{1e3 * x:.0f}" for x in item.size) + " mm"
 
 
 def _hue(number: int) -> tuple[float, float, float]:
     return colorsys.hsv_to_rgb((0.61803 * number) % 1.0, 0.8, 0.95)
-
-
-def _labelled(
-    image: NDArray[np.float32], camera: Camera, T_world_camera: Array, found: Sequence[ListedObject]
-) -> NDArray[np.float32]:
-    """Return the image (H, W, 3) in 0..1 with labels that do not overlap."""
-    marked = (255 * np.clip(image, 0, 1)).round().astype(np.uint8)
-    taken: list[tuple[int, int, int, int]] = []
-    for item in found:
-        x, y, z = transform_points(inverse(T_world_camera), item.at_world)
-        if z <= 0:
-            continue
-        u, v = round(camera.fx * x / z + camera.cx), round(camera.fy * y / z + camera.cy)
-        text = f"{item.number}: {item.label}"
-        (wide, tall), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.55, 1)
-        left = int(np.clip(u - wide // 2, 4, camera.width - wide - 4))
-        top = int(np.clip(v - 60, 8 + tall, camera.height - 8))
-        while any(left < r and left + wide > a and top - tall < d and top > b for a, b, r, d in taken):
-            top += tall + 10
-        taken.append((left - 6, top - tall - 6, left + wide + 6, top + 6))
-        cv2.line(marked, (u, v), (left + wide // 2, top + 4), (235, 235, 235), 1, cv2.LINE_AA)
-        cv2.rectangle(marked, (left - 5, top - tall - 5), (left + wide + 5, top + 6), (25, 28, 32), -1)
-        color = [round(255 * c) for c in _hue(item.number)]
-        cv2.putText(marked, text, (left, top), cv2.FONT_HERSHEY_SIMPLEX, 0.55, color, 1, cv2.LINE_AA)
-    return marked.astype(np.float32) / 255.0

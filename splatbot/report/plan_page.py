@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -15,8 +14,10 @@ from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import inverse, look_at, transform_points
 from splatbot.planning import JointTrajectory
+from splatbot.planning.timing import clearance_text
 from splatbot.protocols import Array
 from splatbot.rasterize.views import to_png
+from splatbot.report.annotations import with_legend, with_scale
 from splatbot.report.moving_page import bytes_of, evenly_spaced, moving_page, packed
 from splatbot.report.robot_drawing import DrawnPart, draw_robot, map_view
 
@@ -30,20 +31,19 @@ class PlanPageConstants:
         crop_radius: [m] radius of the map around the base that is shown.
         frames: postures of the animation.
         ghosts: postures in the image.
-        legend: [px] height of a line of the image's legend.
     """
 
     max_points: int = 40_000
     crop_radius: float = 1.6
     frames: int = 80
     ghosts: int = 5
-    legend: int = 28
 
 
 CONSTANTS = PlanPageConstants()
 
 
 _START, _END = np.array([0.15, 0.45, 0.9]), np.array([0.95, 0.5, 0.1])  # tints of the ends
+_START_SHADE, _END_SHADE = (0.49, 0.67, 0.94), (0.97, 0.7, 0.46)  # as the shaded arms look
 _EYE, _TARGET = np.array([-0.9, 1.3, 1.2]), np.array([0.4, 0.0, 0.2])  # camera of the image, in the base frame [m]
 
 
@@ -97,8 +97,8 @@ def plan_html(
     }
     c = trajectory.certificate
     facts = (
-        f"{trajectory.duration:.2f} s; {'certified' if c.certified else 'NOT certified'}, clearance at least "
-        f"{1e3 * c.clearance:.1f} mm beyond a margin of {1e3 * c.margin:.1f} mm; map version {c.map_version}"
+        f"{trajectory.duration:.2f} s; {'certified' if c.certified else 'NOT certified'}, clearance "
+        f"{clearance_text(c)}; map version {c.map_version}"
     )
     return moving_page(title, facts, document, "plan_view.js", toggle="certified spheres")
 
@@ -141,12 +141,9 @@ def plan_png(
             tint=(1 - share) * _START + share * _END,
             opacity=1.0 if k in (0, last) else 0.3,
         )
-    picture = np.rint(255 * np.clip(view, 0.0, 1.0)).astype(np.uint8)
-    for row, (text, color) in enumerate((("start", _START), ("goal", _END))):
-        place = (CONSTANTS.legend, CONSTANTS.legend * (row + 1))
-        shade = tuple(float(value) for value in 255 * (0.4 + 0.6 * color))
-        cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.7, shade, 2, cv2.LINE_AA)
-    return to_png((picture / 255).astype(np.float32), "rgb")
+    view = with_legend(view, [("arm at the start", _START_SHADE), ("arm at the goal", _END_SHADE)])
+    away = float(np.linalg.norm(_EYE - _TARGET))
+    return to_png(with_scale(view, camera, away, "at the middle of the picture"), "rgb")
 
 
 def _within(model: GaussianModel, T_base_world: Array) -> NDArray[np.int64]:

@@ -15,6 +15,7 @@ from splatbot.geometry import transform_points
 from splatbot.protocols import Array
 from splatbot.rasterize.views import CONSTANTS as VIEWS
 from splatbot.rasterize.views import render_rgbd
+from splatbot.report.annotations import Color
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,6 @@ class RobotDrawingConstants:
 
 CONSTANTS = RobotDrawingConstants()
 
-Color = tuple[float, float, float]
 BACKGROUND = (0.09, 0.1, 0.12)
 _LIGHT = np.array([0.3, 0.55, 0.78])  # unit direction against the optical axis, in the camera frame (-x, -y, -z)
 

@@ -5,21 +5,21 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import pairwise, product
 
-import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from splatbot.camera import Camera
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import inverse, look_at, transform_points
 from splatbot.protocols import Array
 from splatbot.rasterize.views import render_view, to_png
+from splatbot.report.annotations import with_legend
+from splatbot.report.robot_drawing import BACKGROUND
 from splatbot.report.sphere_gaussians import sphere_gaussians
 from splatbot.workspace import Workspace
 
 _LEGEND = {
-    "support plane": (0.2, 0.75, 0.95),
+    "support plane, grid of 10 cm": (0.2, 0.75, 0.95),
     "workspace": (0.95, 0.6, 0.1),
     "camera path": (0.95, 0.2, 0.6),
     "base x": (0.9, 0.15, 0.15),
@@ -85,8 +85,9 @@ def workspace_png(
     views = []
     for side in _SIDES:
         eye = at + distance * side / np.linalg.norm(side)
-        views.append(render_view(scene, camera, T @ look_at(eye, at), background=(0.09, 0.1, 0.12)))
-    return to_png(_with_legend(np.ascontiguousarray(np.concatenate(views, axis=1))), "rgb")
+        views.append(render_view(scene, camera, T @ look_at(eye, at), background=BACKGROUND))
+    picture = np.ascontiguousarray(np.concatenate(views, axis=1))
+    return to_png(with_legend(picture, list(_LEGEND.items())), "rgb")
 
 
 def _lines(box: Array) -> dict[str, list[tuple[Array, Array]]]:
@@ -101,7 +102,7 @@ def _lines(box: Array) -> dict[str, list[tuple[Array, Array]]]:
     edges = [(a, b) for a in corners for b in corners if (a != b).sum() == 1 and (b > a).any()]
     axes = CONSTANTS.axis_length * np.eye(3)
     named = {name: [(np.zeros(3), axes[k])] for k, name in enumerate(("base x", "base y", "base z, up"))}
-    return {"support plane": grid, "workspace": edges, **named}
+    return {"support plane, grid of 10 cm": grid, "workspace": edges, **named}
 
 
 def _dots(a: Array, b: Array) -> Array:
@@ -113,15 +114,3 @@ def _drawn(dots: Array, name: str) -> GaussianModel:
     thick = 2.0 if name.startswith("base") else 1.0
     radii = np.full(len(dots), thick * CONSTANTS.line_radius)
     return sphere_gaussians(dots, radii, np.array(_LEGEND[name]), 0.9)
-
-
-def _with_legend(image: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the image (H, W, 3) in 0..1 with the names of the lines in its upper left corner."""
-    legend = np.zeros(image.shape, np.uint8)  # OpenCV writes text into 8 bits only
-    for row, (name, color) in enumerate(_LEGEND.items()):
-        y = 24 + 22 * row
-        cv2.line(legend, (14, y - 5), (38, y - 5), [round(255 * c) for c in color], 4, cv2.LINE_AA)
-        cv2.putText(legend, name, (46, y), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (242, 242, 242), 1, cv2.LINE_AA)
-    dimmed = image.copy()
-    dimmed[: 22 * len(_LEGEND) + 14, :172] *= 0.25
-    return np.maximum(dimmed, legend.astype(np.float32) / 255.0)

@@ -24,11 +24,13 @@ class RegionPlanConstants:
         rounds: largest number of plans; each has the margin that the path before required, and a little more.
         growth: factor of that margin, so that the rounds end although each path passes other points.
         samples: number of configurations of a trajectory that define its region.
+        base_foot: [m] height below which the base may touch the map, on which it stands.
     """
 
     rounds: int = 8
     growth: float = 1.1
     samples: int = 200
+    base_foot: float = 0.03
 
 
 CONSTANTS = RegionPlanConstants()
@@ -55,6 +57,8 @@ class RegionPlan:
     def scope(self, *, n_sigma: float, unknown: str, confidence: float) -> dict[str, Any]:
         """Describe the scope of the certificate: obstacles, unknown space, and the origin of the margin.
 
+        The base is not checked, but ``base_in_map`` says whether more than its foot is in the map.
+
         Args:
             n_sigma: surface of the map's Gaussians, in standard deviations.
             unknown: how unknown space counts: "free", "cautious" or "occupied".
@@ -66,6 +70,7 @@ class RegionPlan:
             "n_sigma": n_sigma,
             "self_collision": True,
             "base": False,
+            "base_in_map": self.planner.arm.base_in_map_above(self.planner.field, CONSTANTS.base_foot),
             "unknown_space": unknown,
             "margin_m": margin,
             "margin_from": "audit" if audited else "user" if margin > 0 else "none",

@@ -50,8 +50,10 @@ def unknown_in_reach(run: RunFolder, log: Log, arm: RobotSpheres) -> UnknownSpac
     return find_unknown(box, voxel, raw_views(run, log)[1])
 
 
-def obstacles(space: UnknownSpace, policy: UnknownPolicy, arm: RobotSpheres, occupied: ArrayLike) -> GaussianModel:
-    """Return the solids of unknown space under a policy, without those that touch the arm where it is known to be.
+def obstacles(
+    space: UnknownSpace, policy: UnknownPolicy, arm: RobotSpheres, occupied: ArrayLike, *, margin: float = 0.0
+) -> GaussianModel:
+    """Return the solids of unknown space under a policy, without those near the arm where it is known to be.
 
     The arm fills space that no camera sees, and is there without a collision.
 
@@ -60,12 +62,14 @@ def obstacles(space: UnknownSpace, policy: UnknownPolicy, arm: RobotSpheres, occ
         policy: treatment of unknown space.
         arm: the arm.
         occupied: (C, J) configurations at which the arm is or was [rad or m].
+        margin: clearance that a plan keeps [m]. Solids within it of the arm are left out too, because a plan could not
+            start there.
     """
     solids = space.solids(policy=policy)
     if not len(solids):
         return solids
     q = np.atleast_2d(np.asarray(occupied, dtype=np.float64))
-    centers, radii = arm.centers(q).reshape(-1, 3), np.tile(arm.spheres.radii, len(q))
+    centers, radii = arm.centers(q).reshape(-1, 3), np.tile(arm.spheres.radii + margin, len(q))
     means, size = solids.means.double().numpy(), np.sqrt(3) / 2 * space.voxel
     touched = np.zeros(len(means), np.bool_)
     for rows in cKDTree(means).query_ball_point(centers, radii + size):

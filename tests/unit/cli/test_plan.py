@@ -13,11 +13,13 @@ import pytest
 
 from splatbot.bench.tabletop import tabletop
 from splatbot.collision import GaussianCollisionField, RobotSpheres
+from splatbot.errors import SplatbotError
 from splatbot.robots.panda import panda
 from splatbot.workspace import Workspace
 from tests.unit.cli.conftest import RunCommand, assert_refused
 
 BASE = ("--base", 0, 0, 0, 1, 0, 0, 0)
+UPRIGHT = (0.0, 0.0, 0.0, -0.5, 0.0, 0.5, 0.8)
 GOAL = (0.9, -0.3, 0.1, -2.0, 0.2, 1.8, 0.5)
 
 
@@ -36,6 +38,10 @@ def test_a_certified_trajectory_is_written_with_its_pictures(run: RunCommand, ma
     summary = json.loads((out / "plan.json").read_text())
     assert summary["status"] == "SUCCESS"
     assert summary["certified"]
+    assert summary["robot"] == "panda"
+    assert summary["joint_names"] == [f"panda_joint{k}" for k in range(1, 8)]
+    assert summary["T_world_base"] == {"translation": [0, 0, 0], "quaternion_wxyz": [1, 0, 0, 0]}
+    assert not summary["covers"]["base_in_map"]
     message = json.loads((out / "trajectory.json").read_text())
     np.testing.assert_allclose(message["points"][0]["positions"], panda().home, atol=1e-9)
     np.testing.assert_allclose(message["points"][-1]["positions"], GOAL, atol=1e-9)
@@ -57,6 +63,30 @@ def test_a_certified_trajectory_is_written_with_its_pictures(run: RunCommand, ma
     assert len(link) < 6000
     poses = np.frombuffer(base64.b64decode(data["poses"]), np.float32).reshape(-1, 8, 3, 4)
     np.testing.assert_allclose(poses[-1], panda().fk(np.array(GOAL))[:, :3], atol=1e-5)
+
+
+def test_a_base_that_stands_in_the_map_is_reported(run: RunCommand, map_file: Path, tmp_path: Path) -> None:
+    sunk = ("--base", 0.6, -0.7, -0.06, 1, 0, 0, 0, "--start", *UPRIGHT, "--goal", *UPRIGHT)
+    answer = run("plan", "--map", map_file, *sunk, "--out", tmp_path / "out")
+    assert answer.code == 0, answer.err
+    assert "stands in the map by more than its foot; check --base" in answer.out
+
+
+def test_unknown_space_at_the_start_is_named_instead_of_a_gaussian() -> None:
+    from splatbot.cli.plan import _refuse_unknown
+    from splatbot.gaussians import GaussianModel
+    from splatbot.planning import GaussianRRTStar
+
+    model = tabletop().gaussians(2000)
+    at = RobotSpheres(panda()).centers(panda().home[None])[0, 100:102]
+    unknown = GaussianModel.from_activated(
+        means=at, quats=np.eye(4)[[0, 0]], scales=np.full((2, 3), 0.01), opacities=np.ones(2), colors=np.ones((2, 3))
+    )
+    field = GaussianCollisionField(GaussianModel.concatenate([model, unknown]))
+    result = GaussianRRTStar(field, panda()).plan(panda().home, panda().home, budget_ms=10)
+    with pytest.raises(SplatbotError, match="no frame saw to be empty"):
+        _refuse_unknown(result, len(model))
+    _refuse_unknown(result, len(model) + 2)  # a Gaussian of the map is named by the planner
 
 
 def test_the_base_is_taken_from_the_scene_file_of_the_map_and_a_pose_is_reached(

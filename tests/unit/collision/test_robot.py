@@ -206,6 +206,13 @@ def test_a_margin_is_room_to_the_map_and_not_to_the_arm_itself(field: GaussianCo
     assert (bare.clearance(field, middle[free]).distance > 0.03).all()
 
 
+def test_a_base_stands_on_the_map_with_its_foot_alone(field: GaussianCollisionField) -> None:
+    assert not RobotSpheres(panda()).base_in_map_above(field, 0.03)
+    sunk = RobotSpheres(panda(), T_world_base=pose_from_quat([0.5, 0.0, -0.1], [1.0, 0.0, 0.0, 0.0]))
+    assert sunk.base_in_map_above(field, 0.03)
+    assert not sunk.base_in_map_above(field, 0.2)
+
+
 def test_a_robot_and_a_map_moved_together_give_the_same_answers() -> None:
     rng = np.random.default_rng(8)
     model = SCENE.gaussians(5000)

@@ -1,0 +1,122 @@
+"""Legends, scale bars and numbers on rendered pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from splatbot.camera import Camera
+from splatbot.protocols import Array
+
+
+@dataclass(frozen=True)
+class AnnotationConstants:
+    """Constants of annotations.
+
+    Args:
+        row: [px] height of a row of a legend.
+        font: scale of OpenCV's Hershey font.
+        dim: brightness of the picture behind a legend, relative to the picture.
+        badge: [px] least distance between two numbers along an axis.
+        turns: places around a centre that are tried for a number, from inside to outside.
+        bars: [m] lengths of which a scale bar takes the largest that fills at most a fifth of the width.
+    """
+
+    row: int = 22
+    font: float = 0.5
+    dim: float = 0.25
+    badge: tuple[int, int] = (28, 20)
+    turns: int = 2000
+    bars: tuple[float, ...] = (1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01)
+
+
+CONSTANTS = AnnotationConstants()
+
+Color = tuple[float, float, float]
+_FONT = cv2.FONT_HERSHEY_SIMPLEX
+_LIGHT, _DARK = (242, 242, 242), (25, 28, 32)
+
+
+def with_legend(image: NDArray[np.float32], rows: Sequence[tuple[str, Color]]) -> NDArray[np.float32]:
+    """Return an image (H, W, 3) in 0..1 with names and their colours in the upper left corner."""
+    fits = max((image.shape[0] - 14) // CONSTANTS.row, 1)
+    if len(rows) > fits:
+        rows = [*rows[: fits - 1], (f"and {len(rows) - fits + 1} more", (0.5, 0.5, 0.5))]
+    width = max((cv2.getTextSize(name, _FONT, CONSTANTS.font, 1)[0][0] for name, _ in rows), default=0) + 58
+    marked = _bytes(image)
+    corner = marked[: CONSTANTS.row * len(rows) + 14, :width]
+    corner[:] = (CONSTANTS.dim * corner).astype(np.uint8)
+    for number, (name, color) in enumerate(rows):
+        y = 24 + CONSTANTS.row * number
+        cv2.line(marked, (14, y - 5), (38, y - 5), _shade(color), 5, cv2.LINE_AA)
+        cv2.putText(marked, name, (46, y), _FONT, CONSTANTS.font, _LIGHT, 1, cv2.LINE_AA)
+    return _floats(marked)
+
+
+def with_scale(image: NDArray[np.float32], camera: Camera, depth: float, where: str) -> NDArray[np.float32]:
+    """Return an image (H, W, 3) in 0..1 with a bar in its lower right corner that shows a length at a depth [m]."""
+    most = camera.width / 5
+    length = next((m for m in CONSTANTS.bars if camera.fx * m / depth <= most), CONSTANTS.bars[-1])
+    pixels = round(camera.fx * length / depth)
+    marked = _bytes(image)
+    right, y = image.shape[1] - 20, image.shape[0] - 18
+    text = f"{100 * length:g} cm {where}"
+    wide = cv2.getTextSize(text, _FONT, CONSTANTS.font, 1)[0][0]
+    corner = marked[y - 34 :, right - max(wide, pixels) - 16 :]
+    corner[:] = (CONSTANTS.dim * corner).astype(np.uint8)
+    cv2.rectangle(marked, (right - pixels, y - 1), (right, y + 1), _LIGHT, -1)
+    cv2.putText(marked, text, (right - wide, y - 12), _FONT, CONSTANTS.font, _LIGHT, 1, cv2.LINE_AA)
+    return _floats(marked)
+
+
+def with_numbers(
+    image: NDArray[np.float32], places: Mapping[int, Array], colors: Mapping[int, Color]
+) -> NDArray[np.float32]:
+    """Return an image (H, W, 3) in 0..1 with numbers at places (2,) [px]; crowded ones move aside, on a line."""
+    marked = _bytes(image)
+    apart = _apart(places, np.array([image.shape[1], image.shape[0]]))
+    for number, at in apart.items():
+        if np.abs(at - places[number]).max() > 1:
+            ends = [tuple(int(x) for x in end.round()) for end in (places[number], at)]
+            cv2.line(marked, ends[0], ends[1], _LIGHT, 1, cv2.LINE_AA)
+    for number, at in apart.items():
+        wide, tall = cv2.getTextSize(str(number), _FONT, CONSTANTS.font, 1)[0]
+        left, bottom = round(float(at[0]) - wide / 2), round(float(at[1]) + tall / 2)
+        cv2.rectangle(marked, (left - 4, bottom - tall - 4), (left + wide + 4, bottom + 4), _DARK, -1)
+        cv2.rectangle(marked, (left - 4, bottom - tall - 4), (left + wide + 4, bottom + 4), _shade(colors[number]), 1)
+        cv2.putText(marked, str(number), (left, bottom), _FONT, CONSTANTS.font, _LIGHT, 1, cv2.LINE_AA)
+    return _floats(marked)
+
+
+def _apart(places: Mapping[int, Array], size: Array) -> dict[int, Array]:
+    """Return places [px] with the distance of a badge between them, each the first free one on a spiral."""
+    step = np.arange(CONSTANTS.turns)
+    angle, radius = 2.4 * step, 4.0 * np.sqrt(step)  # golden angle
+    spiral = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+    taken: dict[int, Array] = {}
+    badge = np.array(CONSTANTS.badge)
+    for number, place in places.items():
+        if not ((place >= 0) & (place < size)).all():
+            continue
+        tried = np.clip(place + spiral, badge / 2 + 2, size - badge / 2 - 2)
+        others = np.array(list(taken.values())).reshape(-1, 2)
+        free = (np.abs(tried[:, None] - others) >= badge).any(axis=2).all(axis=1)
+        taken[number] = tried[int(np.argmax(free))]
+    return taken
+
+
+def _bytes(image: NDArray[np.float32]) -> NDArray[np.uint8]:
+    return np.rint(255 * np.clip(image, 0.0, 1.0)).astype(np.uint8)  # OpenCV writes text into 8 bits only
+
+
+def _floats(image: NDArray[np.uint8]) -> NDArray[np.float32]:
+    return image.astype(np.float32) / np.float32(255)
+
+
+def _shade(color: Sequence[float]) -> tuple[int, int, int]:
+    r, g, b = (round(255 * float(c)) for c in color)
+    return r, g, b
