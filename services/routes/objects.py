@@ -8,7 +8,7 @@ import numpy as np
 from fastapi import APIRouter, Depends, Query, Request, Response
 
 from splatbot.errors import InputError
-from splatbot.grasping.object_list import list_objects, list_planes
+from splatbot.grasping.object_list import list_objects, list_planes, stroke_of
 from splatbot.services.arms import known_robot
 from splatbot.services.codecs import answer, answers
 from splatbot.services.dependencies import Served, problems
@@ -48,12 +48,11 @@ def objects(request: Request, served: Served, robot: Annotated[str, Depends(_rob
     arm = known_robot(robot)
     if arm.gripper is None:
         raise InputError("has no hand.", field="robot", hint="name a robot with a gripper, as panda")
-    stroke = 2 * arm.gripper.stroke
     scene = objects_in(served, np.asarray(base_in(served, None)), as_known=True).scene
     body = {
         "map_version": served.map_version,
-        "hand_opens_m": stroke,
+        "hand_opens_m": stroke_of(arm),
         "planes": list_planes(scene),
-        "objects": [item.to_dict() for item in list_objects(scene, stroke)],
+        "objects": [item.to_dict() for item in list_objects(scene, arm)],
     }
     return answer(request, body)

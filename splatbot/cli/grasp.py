@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from splatbot.grasping.affordance import Hint, ObservedView
     from splatbot.grasping.types import GraspResult
     from splatbot.robots.graspable_objects import GraspableObjects
-    from splatbot.robots.robot import RobotModel
 
 
 def grasp(
@@ -106,6 +105,7 @@ def grasp(
     from splatbot.cli.affordances import name_backends
     from splatbot.grasping.advice import first_change
     from splatbot.grasping.affordance import find_target
+    from splatbot.grasping.object_list import stroke_of
     from splatbot.grasping.options import GraspOptions
     from splatbot.grasping.spatial import SpatialAffordance
     from splatbot.grasping.summary import summary
@@ -148,11 +148,6 @@ def grasp(
     result.unwrap()
     _print(result, folder, margin=sampler.margin, raw=sampler.raw is not None, verbose=verbose)
     return 0
-
-
-def stroke_of(arm: RobotModel) -> float:
-    """Return the widest opening of a robot's hand [m], 0 without a hand."""
-    return 2 * arm.gripper.stroke if arm.gripper is not None else 0.0
 
 
 def graspable_objects(map_: Path, base: Pose | None) -> GraspableObjects:

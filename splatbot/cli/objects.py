@@ -37,7 +37,7 @@ def objects(
 
     Args:
         map: a run folder, or a map file.
-        robot: robot whose hand must enclose an object.
+        robot: robot whose hand must enclose an object and whose arm must reach it.
         base: pose of the robot's base in the map; by default that of the scene.yaml next to the map (see
             `splatbot info --fit-plane`).
         as_json: print JSON, in which each length names its unit.
@@ -48,18 +48,18 @@ def objects(
     check_output(picture, folder=False)
 
     from splatbot.atomic import atomic_write
-    from splatbot.cli.grasp import graspable_objects, stroke_of
-    from splatbot.grasping.object_list import list_objects, list_planes
+    from splatbot.cli.grasp import graspable_objects
+    from splatbot.grasping.object_list import list_objects, list_planes, stroke_of
     from splatbot.report.objects_view import objects_png
     from splatbot.robots.store import load_robot
 
-    stroke = stroke_of(load_robot(robot))
+    arm = load_robot(robot)
     scene = graspable_objects(map, base).scene
-    found, planes = list_objects(scene, stroke), list_planes(scene)
+    found, planes = list_objects(scene, arm), list_planes(scene)
     with atomic_write(picture) as handle:
         handle.write(objects_png(scene, found))
     if as_json:
-        values = {"planes": planes, "objects": [item.to_dict() for item in found], "hand_opens_m": stroke}
+        values = {"planes": planes, "objects": [item.to_dict() for item in found], "hand_opens_m": stroke_of(arm)}
         print(json.dumps(values, indent=2))
         return 0
     _print(found, planes)

@@ -236,7 +236,7 @@ def _summary(
     }
 
 
-_BASE_IN_MAP = "NOT COVERED, AND PROBABLY WRONG: the mounted link stands in the map by more than its foot; check --base"
+_BASE_IN_MAP = "NOT COVERED, AND PROBABLY WRONG: more of the mounted link than its foot is in the map; check --base"
 _UNKNOWN = {
     "free": "not covered: counts as free",
     "cautious": "covered where two frames looked and measured no depth",

@@ -161,8 +161,8 @@ def _pixels_in_box(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return rows and columns of the pixels that measure in a box, or within 0.1 mm of it.
 
-    A pixel (u, v) with depth z lies at z (a u + b v + c) + t in the frame of the box, so that one axis of all pixels
-    is computed from a row and a column, in float32.
+    A pixel (u, v) with depth z lies at z (a u + b v + c) + t in the frame of the box. One axis of all pixels needs a
+    row and a column, in float32.
     """
     columns, rows = _pixel_window(low, high, camera, T_box_camera)
     part = depth[rows, columns]

@@ -10,7 +10,7 @@ import numpy as np
 
 from splatbot.geometry import inverse, transform_points
 from splatbot.grasping.language import color_name, shape_name
-from splatbot.protocols import Array
+from splatbot.protocols import Array, HasHand, RobotKinematics
 from splatbot.segmentation import MapObject, SegmentedMap
 from splatbot.segmentation.plane import NEAR
 
@@ -39,7 +39,8 @@ class ListedObject:
         size: (3,) long side, short side and height [m].
         at_world, at_base: (3,) centre of the bounding box [m].
         gaussians: number of Gaussians.
-        obstacle: reason why the hand cannot enclose it, or "".
+        fits: whether the hand can enclose it.
+        obstacle: reason why the hand cannot enclose it or the arm cannot reach it, or "".
     """
 
     number: int
@@ -48,6 +49,7 @@ class ListedObject:
     at_world: Array = field(repr=False)
     at_base: Array = field(repr=False)
     gaussians: int = 0
+    fits: bool = True
     obstacle: str = ""
 
     def to_dict(self) -> dict[str, Any]:
@@ -60,31 +62,34 @@ class ListedObject:
             "center_world_m": self.at_world.round(4).tolist(),
             "center_base_m": self.at_base.round(4).tolist(),
             "gaussians": self.gaussians,
-            "graspable_by_size": not self.obstacle,
+            "graspable_by_size": self.fits,
             "obstacle": self.obstacle or None,
         }
 
 
-def list_objects(scene: SegmentedMap, stroke: float) -> tuple[ListedObject, ...]:
+def list_objects(scene: SegmentedMap, robot: RobotKinematics) -> tuple[ListedObject, ...]:
     """Return the objects of a map, those with most Gaussians first.
 
     Args:
         scene: the segmented map.
-        stroke: widest opening of the hand [m].
+        robot: arm whose hand must enclose an object; without a hand, none fits.
     """
-    T_base_world = inverse(scene.T_world_base)
-    found = [
-        ListedObject(
-            item.number,
-            item.name or f"{color_name(item)} {shape_name(scene, item)}",
-            item.size,
-            item.center,
-            transform_points(T_base_world, item.center),
-            len(item.rows),
-            obstacle(item, stroke),
+    T_base_world, stroke = inverse(scene.T_world_base), stroke_of(robot)
+    found = []
+    for item in scene.objects:
+        at, size = transform_points(T_base_world, item.center), obstacle(item, stroke)
+        found.append(
+            ListedObject(
+                item.number,
+                item.name or f"{color_name(item)} {shape_name(scene, item)}",
+                item.size,
+                item.center,
+                at,
+                len(item.rows),
+                not size,
+                size or _too_far(at - float(np.linalg.norm(item.size)) / 2 * at / np.linalg.norm(at), robot),
+            )
         )
-        for item in scene.objects
-    ]
     several = {label for label, count in Counter(o.label for o in found).items() if count > 1}
     return tuple(replace(o, label=f"{o.label} {o.number}") if o.label in several else o for o in found)
 
@@ -105,6 +110,28 @@ def list_planes(scene: SegmentedMap) -> list[dict[str, Any]]:
             }
         )
     return planes
+
+
+def stroke_of(robot: RobotKinematics) -> float:
+    """Return the widest opening of a robot's hand [m], 0 without a hand."""
+    hand = robot.hand if isinstance(robot, HasHand) else None
+    return hand.stroke if hand is not None else 0.0
+
+
+def _too_far(nearest: Array, robot: RobotKinematics) -> str:
+    """Return the reason why an arm cannot reach a point (3,) [m, base frame], or "".
+
+    The tool is at most as far from the first joint as all links in line, which the postures of a grasp are not.
+    """
+    if not isinstance(robot, HasHand):
+        return ""
+    chain = robot.chain
+    steps = np.linalg.norm(np.r_[chain.T_before_joint[1:, :3, 3], robot.T_link_tcp[None, :3, 3]], axis=1)
+    travel = np.maximum(np.abs(chain.lower), np.abs(chain.upper))[chain.prismatic]
+    reach, away = float(steps.sum() + travel.sum()), float(np.linalg.norm(nearest - chain.T_before_joint[0, :3, 3]))
+    if away <= reach:
+        return ""
+    return f"it is {away:.2f} m from the first joint, and the arm reaches {reach:.2f} m"
 
 
 def obstacle(item: MapObject, stroke: float) -> str:

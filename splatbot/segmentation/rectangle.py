@@ -48,9 +48,9 @@ def fit_rectangle(points: Array) -> Rectangle:
     """Fit a rectangle to points (P, 2) [m] on the faces of an object, as seen from above.
 
     A camera sees two faces of a box, an L. The smallest rectangle around an L may lie along its diagonal. The direction
-    is that with the most points near edges (Zhang et al., "Efficient L-Shape Fitting for Vehicle Detection Using Laser
-    Scanners", IV 2017, closeness criterion): the largest Σ 1 / max(d, d₀), with the distance d of a point from the
-    nearest edge.
+    is that with the most points near edges. It has the largest Σ 1 / max(d, d₀), with the distance d of a point from
+    the nearest edge. This is the closeness criterion of Zhang et al., "Efficient L-Shape Fitting for Vehicle Detection
+    Using Laser Scanners", IV 2017.
     """
     some = points[np.linspace(0, len(points) - 1, min(len(points), CONSTANTS.max_points)).round().astype(np.int64)]
     yaws = np.arange(CONSTANTS.steps) * (np.pi / 2 / CONSTANTS.steps)

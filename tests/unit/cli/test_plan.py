@@ -69,7 +69,7 @@ def test_a_base_that_stands_in_the_map_is_reported(run: RunCommand, map_file: Pa
     sunk = ("--base", 0.6, -0.7, -0.06, 1, 0, 0, 0, "--start", *UPRIGHT, "--goal", *UPRIGHT)
     answer = run("plan", "--map", map_file, *sunk, "--out", tmp_path / "out")
     assert answer.code == 0, answer.err
-    assert "stands in the map by more than its foot; check --base" in answer.out
+    assert "more of the mounted link than its foot is in the map; check --base" in answer.out
 
 
 def test_unknown_space_at_the_start_is_named_instead_of_a_gaussian() -> None:

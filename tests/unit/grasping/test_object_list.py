@@ -12,11 +12,12 @@ from splatbot.grasping.affordance import NameHint, Target
 from splatbot.grasping.language import LanguageAffordance
 from splatbot.grasping.object_list import list_objects, list_planes, obstacle
 from splatbot.grasping.types import GraspResult
+from splatbot.robots.panda import panda
 from tests.unit.grasping.objects import BOX, OBJECTS, scene, target_of
 
 
 def test_each_object_of_the_list_can_be_named_as_a_target() -> None:
-    found = list_objects(scene(), 0.08)
+    found = list_objects(scene(), panda())
     assert len({item.label for item in found}) == len(found) == len(scene().objects)
     for item in found:
         target = LanguageAffordance().locate(NameHint(f"object {item.number}"), scene())
@@ -25,6 +26,17 @@ def test_each_object_of_the_list_can_be_named_as_a_target() -> None:
     red = target_of(scene(), BOX, "box").number
     assert found[red].label.startswith("red box")
     np.testing.assert_allclose(sorted(found[red].size), sorted(BOX.size), atol=0.01)
+
+
+def test_an_object_beyond_the_arm_is_listed_with_its_distance() -> None:
+    near = scene()
+    T = near.T_world_base.copy()
+    T[:3, 3] -= [2.0, 0.0, 0.0]  # the base two metres farther back
+    found = list_objects(replace(near, T_world_base=T), panda())
+    fitting = [item for item in found if item.fits]
+    assert fitting
+    assert all("from the first joint, and the arm reaches" in item.obstacle for item in fitting)
+    assert not any("reaches" in item.obstacle for item in list_objects(near, panda()))
 
 
 def test_planes_name_height_and_size() -> None:

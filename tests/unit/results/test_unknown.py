@@ -12,7 +12,7 @@ MARGIN = 0.02
 
 
 def around_the_arm() -> UnknownSpace:
-    """Unknown space of 1 m around a Panda at its home posture: every second voxel of 2 cm, so that all are rims."""
+    """Return unknown space around a Panda at its home posture: every second voxel of 2 cm, so that all are rims."""
     every_second = np.indices((50, 50, 50)).sum(axis=0) % 2 == 0
     return UnknownSpace(every_second, every_second, np.array([-0.3, -0.5, 0.05]), 0.02)
 
