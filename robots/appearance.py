@@ -23,7 +23,7 @@ from splatbot.errors import FormatError
 from splatbot.geometry import transform_points
 from splatbot.protocols import Array
 from splatbot.report.robot_drawing import Color, DrawnPart
-from splatbot.robots.maker_meshes import SOURCES, Source
+from splatbot.robots.maker_meshes import Source
 from splatbot.robots.panda import T_LINK_HAND, panda
 from splatbot.robots.robot import RobotModel
 from splatbot.robots.visual import MOST_TRIANGLES, STEP, simplify
@@ -155,4 +155,6 @@ def save_appearance(source: Source, path: Path) -> None:
 
 
 if __name__ == "__main__":
+    from splatbot.robots.sources import SOURCES
+
     save_appearance(SOURCES["panda"], _FILE)

@@ -26,6 +26,7 @@ from splatbot.robots.robot import GripperGeometry, Inertial, RobotModel
 from splatbot.robots.shapes import Box, Capsule, Mesh, Shape
 
 _FLANGE = 0.107  # [m] of the Panda's last link
+_ROOT_2F85 = 0.09  # [m] from the flange to the frame of its fingers
 _WRIST = 3  # links before the last one that a hand may touch at home
 _TURNED = np.diag([-1.0, -1.0, 1.0, 1.0])
 
@@ -74,26 +75,6 @@ def roots(z: float) -> Array:
     return np.stack([_along_z(z) @ turn for turn in (np.eye(4), _TURNED)])
 
 
-ROBOTIQ_2F85 = Hand(
-    "2f85",
-    T_flange_tcp=_along_z(0.145),
-    body=(
-        Capsule(0, (0.0, 0.0, 0.02), (0.0, 0.0, 0.06), 0.04),
-        Capsule(0, (0.0, -0.05, 0.085), (0.0, 0.05, 0.085), 0.02),
-    ),
-    T_flange_finger=roots(0.09),
-    # 22 mm wide and, up to 38 mm from their tips, 10 mm thick with round edges. Checks with the target use boxes of the
-    # thickness at the roots, 20 mm.
-    finger=(
-        Capsule(0, (-0.006, 0.005, 0.0), (-0.006, 0.005, 0.068), 0.005),
-        Capsule(0, (0.006, 0.005, 0.0), (0.006, 0.005, 0.068), 0.005),
-        Capsule(0, (0.0, 0.01, 0.0), (0.0, 0.01, 0.025), 0.01),
-    ),
-    stroke=0.0425,
-    force=70.0,
-    speed=0.15,
-    mass=0.925,
-)
 ROBOTIQ_2F140 = Hand(
     "2f140",
     T_flange_tcp=_along_z(0.205),
@@ -108,6 +89,47 @@ ROBOTIQ_2F140 = Hand(
     speed=0.15,
     mass=1.025,
 )
+
+
+@cache
+def robotiq_2f85() -> Hand:
+    """Return Robotiq's 2F-85, whose spheres contain its levers at every opening.
+
+    The tool frame is that of the nearly closed hand. Its pads are 14 mm shorter at 85 mm than closed.
+    """
+    body = load_body("2f85")
+    return Hand(
+        "2f85",
+        T_flange_tcp=_along_z(0.145),
+        body=(
+            Capsule(0, (0.0, 0.0, 0.034), (0.0, 0.0, 0.04), 0.034),
+            Capsule(0, (0.0, -0.055, 0.085), (0.0, 0.055, 0.085), 0.014),
+        ),
+        T_flange_finger=roots(_ROOT_2F85),
+        # Capsules of the twin, which lie in the spheres: 22 mm wide and, up to 38 mm from their tips, 10 mm thick.
+        finger=(
+            Capsule(0, (-0.006, 0.005, 0.02), (-0.006, 0.005, 0.068), 0.005),
+            Capsule(0, (0.006, 0.005, 0.02), (0.006, 0.005, 0.068), 0.005),
+            Capsule(0, (0.0, 0.012, 0.014), (0.0, 0.012, 0.025), 0.008),
+        ),
+        stroke=0.0425,
+        force=70.0,
+        speed=0.15,
+        mass=0.925,
+        body_covering=body.on("hand", 0),
+        finger_covering=body.on("finger", 0, _along_z(-_ROOT_2F85)),
+        box=HandShape(
+            stroke=0.085,
+            width=0.022,
+            thickness=0.02,
+            tip=0.018,
+            pad=0.013,
+            pad_width=0.012,
+            palm=0.04,
+            palm_size=(0.075, 0.1485),
+            force=70.0,
+        ),
+    )
 
 
 @cache
@@ -142,7 +164,9 @@ def find_hand(name: str) -> Hand:
     if name not in HAND_NAMES:
         hint = f"grippers: {', '.join(HAND_NAMES)}, or the URDF of a parallel gripper"
         raise InputError(f"is {name!r}.", field="gripper", hint=hint)
-    return franka_hand() if name == "panda_hand" else {h.name: h for h in (ROBOTIQ_2F85, ROBOTIQ_2F140)}[name]
+    if name == "2f140":
+        return ROBOTIQ_2F140
+    return robotiq_2f85() if name == "2f85" else franka_hand()
 
 
 def attach(arm: RobotModel, hand: Hand) -> RobotModel:
@@ -191,7 +215,7 @@ def attach(arm: RobotModel, hand: Hand) -> RobotModel:
 @cache
 def panda_2f85() -> RobotModel:
     """Return the Panda with the 2F-85."""
-    return _panda_with(ROBOTIQ_2F85)
+    return _panda_with(robotiq_2f85())
 
 
 @cache

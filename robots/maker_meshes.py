@@ -1,7 +1,6 @@
 """Meshes that the makers of arms publish, from packages that ship them; splatbot ships spheres that contain them.
 
-The package example-robot-data holds Franka's franka_description (Apache-2.0). Collada files need pycollada. Both are in
-the extra ``dev``.
+The sources are in :mod:`splatbot.robots.sources`. Collada files need pycollada. All packages are in the extra ``dev``.
 """
 
 from __future__ import annotations
@@ -9,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import importlib.metadata
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +30,7 @@ class Source:
         origin: publication that the package copies.
         licence: SPDX identifier of that publication.
         parts: files of each part, visual and collision meshes, relative to the folder.
+        share: share of the slack that the fit of a part gets; 1 for other parts.
     """
 
     package: str
@@ -38,6 +38,7 @@ class Source:
     origin: str
     licence: str
     parts: dict[str, tuple[str, ...]]
+    share: dict[str, float] = field(default_factory=dict)
 
     def path(self, file: str) -> Path:
         """Return the path of an installed file.
@@ -59,6 +60,10 @@ class Source:
     def version(self) -> str:
         """Return the installed version of the package."""
         return importlib.metadata.version(self.package)
+
+    def title(self) -> str:
+        """Return package, version, origin and licence."""
+        return f"{self.package} {self.version()} ({self.origin}, {self.licence})"
 
     def digest(self) -> str:
         """Return a SHA-256 digest of all files."""
@@ -170,16 +175,5 @@ def _is_nearly_hull(mesh: trimesh.Trimesh, hull: trimesh.Trimesh) -> bool:
         for k in range(0, len(centers), _CHUNK)
     )
 
-
-_LINKS = tuple(f"link{k}" for k in range(8))
-SOURCES = {
-    "panda": Source(
-        "example-robot-data",
-        "panda_description/meshes",
-        "franka_description by Franka Robotics",
-        "Apache-2.0",
-        {part: (f"visual/{part}.dae", f"collision/{part}.stl") for part in (*_LINKS, "hand", "finger")},
-    ),
-}
 
 ReportProgress = Callable[[str], None]

@@ -22,8 +22,8 @@ from splatbot.collision.fcl_models import fcl_mesh
 from splatbot.geometry import so3_exp
 from splatbot.planning import GaussianRRTStar, time_path
 from splatbot.protocols import Array
-from splatbot.robots.maker_meshes import SOURCES
 from splatbot.robots.panda import panda
+from splatbot.robots.sources import SOURCES
 from tests.attacks.command_line import exit_code, seeded_parser
 
 PER_SCENE = 25  # problems

@@ -80,7 +80,7 @@ def fit_body(source: Source, slack: float, report_progress: ReportProgress) -> B
     parts = {}
     for part in source.parts:
         shapes = source.shapes(part)
-        spheres = np.c_[rounded(*cover_solids(shapes, slack, FINE))]
+        spheres = np.c_[rounded(*cover_solids(shapes, slack * source.share.get(part, 1.0), FINE))]
         triangles = np.concatenate([shape.triangles() for shape in shapes])
         if len(open_pieces(triangles, spheres[:, :3], spheres[:, 3])):
             raise InputError("is not contained after rounding.", field=part, hint="fit with another slack")

@@ -17,7 +17,7 @@ def record(
     /,
     *,
     out: Annotated[Path, tyro.conf.arg(metavar="FILE")],
-    camera: str | None = None,
+    camera: Annotated[str | None, tyro.conf.arg(metavar="PRESET|FILE")] = None,
 ) -> None:
     """Write a log as one MCAP file of ROS 2 messages, which Foxglove, ROS tools and splatbot itself read.
 

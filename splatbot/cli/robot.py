@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
+
+if TYPE_CHECKING:
+    from splatbot.robots.bodies.check import Part
 
 
 def robot(
@@ -36,6 +39,7 @@ def robot(
         splatbot robot add menagerie/ufactory_xarm7/xarm7.xml --name lab-xarm
         splatbot robot info panda
         splatbot robot info panda --check-meshes --out panda-body.png
+        splatbot robot info ur5e-2f85 --check-meshes
         splatbot robot fit panda --slack 0.011 --out panda.json
         splatbot robot mjcf panda --out panda.xml
 
@@ -80,17 +84,18 @@ def robot(
 
 
 def _check_known(name: str) -> None:
-    """Refuse a robot whose maker's meshes are not known.
+    """Refuse a robot or hand whose maker's meshes are not known.
 
     Raises:
         InputError: they are not.
     """
     from splatbot.errors import InputError
     from splatbot.robots.arms import ARMS
-    from splatbot.robots.maker_meshes import SOURCES
+    from splatbot.robots.sources import SOURCES
 
     if name not in SOURCES and name not in ARMS:
-        raise InputError(f"has no known meshes: {name!r}.", field="robot", hint=f"arms: {', '.join([*SOURCES, *ARMS])}")
+        known = ", ".join([*SOURCES, *ARMS])
+        raise InputError(f"has no known meshes: {name!r}.", field="robot", hint=f"known: {known}")
 
 
 def _fit(name: str, out: Path | None, slack: float | None) -> int:
@@ -98,7 +103,7 @@ def _fit(name: str, out: Path | None, slack: float | None) -> int:
     from splatbot.robots.arms import ARMS
     from splatbot.robots.arms.fit import fit_arm
     from splatbot.robots.bodies import fit_body, save_body
-    from splatbot.robots.maker_meshes import SOURCES
+    from splatbot.robots.sources import SOURCES
     from splatbot.robots.store import save_robot
 
     _check_known(name)
@@ -115,24 +120,16 @@ def _fit(name: str, out: Path | None, slack: float | None) -> int:
 
 def _check_meshes(name: str, out: Path | None) -> int:
     """Print containment and slack of each part; return 1 if a part is not contained."""
-    from splatbot.cli.tables import print_table
-    from splatbot.robots.arms import ARMS
-    from splatbot.robots.arms.fit import described
-    from splatbot.robots.bodies import load_body
-    from splatbot.robots.bodies.check import check_parts, draw_parts, parts_of_arm, parts_of_body
-    from splatbot.robots.maker_meshes import SOURCES
-    from splatbot.robots.store import load_robot
+    from splatbot.cli.tables import print_table, print_text
+    from splatbot.robots.bodies.check import check_parts, draw_parts
 
-    _check_known(name)
-    if name in ARMS:
-        source, robot = ARMS[name].source, load_robot(name)
-        parts = parts_of_arm(described(name).shapes, robot.spheres(), robot)
-    else:
-        source, body = SOURCES[name], load_body(name)
-        parts = parts_of_body(body, source)
-        if body.source["sha256"] != source.digest():
-            print("note: the body was fitted to other meshes than those that are installed")
+    arm, _, hand = name.partition("-")
+    parts, title = _arm_parts(arm, own_hand=not hand)
+    if hand:
+        of_hand, hand_title = _hand_parts(hand)
+        parts, title = parts | of_hand, f"{title}; {hand_title}"
     checks = check_parts(parts)
+    print_text(title)
     print_table(
         [
             (
@@ -141,13 +138,47 @@ def _check_meshes(name: str, out: Path | None) -> int:
                 f"{1e3 * p.slack.median:.1f} mm (median), {1e3 * p.slack.most99:.1f} mm (99 %)",
             )
             for p in checks
-        ],
-        title=f"{source.package} {source.version()} ({source.origin}, {source.licence})",
+        ]
     )
     picture = out if out is not None else Path(f"{name}-body.png")
     draw_parts(parts, picture)
     print(f"picture: {picture}")
     return 0 if max(p.uncovered for p in checks) <= 0 else 1
+
+
+def _arm_parts(name: str, *, own_hand: bool) -> tuple[dict[str, Part], str]:
+    """Return the parts of an arm, with or without the hand of its maker, and the source of its meshes."""
+    from splatbot.robots.arms import ARMS
+    from splatbot.robots.arms.fit import described
+    from splatbot.robots.bodies import load_body
+    from splatbot.robots.bodies.check import parts_of_arm, parts_of_body
+    from splatbot.robots.sources import SOURCES
+    from splatbot.robots.store import load_robot
+
+    _check_known(name)
+    if name in ARMS:
+        source, robot = ARMS[name].source, load_robot(name)
+        return parts_of_arm(described(name).shapes, robot.spheres(), robot), source.title()
+    source, body = SOURCES[name], load_body(name)
+    parts = parts_of_body(body, source)
+    if body.source["sha256"] != source.digest():
+        print("note: the body was fitted to other meshes than those that are installed")
+    return {part: own for part, own in parts.items() if own_hand or part not in ("hand", "finger")}, source.title()
+
+
+def _hand_parts(name: str) -> tuple[dict[str, Part], str]:
+    """Return the parts of a hand and the source of its meshes.
+
+    Raises:
+        InputError: no package has them.
+    """
+    from splatbot.errors import InputError
+
+    if name == "2f140":
+        hint = "check the arm alone; its shapes are drawn from the data sheet"
+        raise InputError("has no published meshes, so that nothing is proven.", field=name, hint=hint)
+    parts, title = _arm_parts("panda" if name == "panda_hand" else name, own_hand=True)
+    return {part: parts[part] for part in ("hand", "finger")}, title
 
 
 def _add(

@@ -5,7 +5,9 @@ from __future__ import annotations
 import sys
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
 
 from splatbot.cli.paths import check_camera, check_file, check_output
 from splatbot.errors import InputError
@@ -22,20 +24,20 @@ MAP_ID = "default"
 
 def serve(
     *,
-    map: Path | None = None,
-    log: str | None = None,
-    data: Path | None = None,
-    camera: str | None = None,
-    host: str | None = None,
-    port: int | None = None,
-    ros_port: int | None = None,
-    viewer_port: int | None = None,
-    record: Path | None = None,
-    config: Path | None = None,
-    service_config: Path | None = None,
+    map: Annotated[Path | None, tyro.conf.arg(metavar="RUN|MAP")] = None,
+    log: Annotated[str | None, tyro.conf.arg(metavar="LOG")] = None,
+    data: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
+    camera: Annotated[str | None, tyro.conf.arg(metavar="PRESET|FILE|CAMERA")] = None,
+    host: Annotated[str | None, tyro.conf.arg(metavar="ADDRESS")] = None,
+    port: Annotated[int | None, tyro.conf.arg(metavar="PORT")] = None,
+    ros_port: Annotated[int | None, tyro.conf.arg(metavar="PORT")] = None,
+    viewer_port: Annotated[int | None, tyro.conf.arg(metavar="PORT")] = None,
+    record: Annotated[Path | None, tyro.conf.arg(metavar="MCAP")] = None,
+    config: Annotated[Path | None, tyro.conf.arg(metavar="YAML")] = None,
+    service_config: Annotated[Path | None, tyro.conf.arg(metavar="YAML")] = None,
     insecure_no_auth: bool = False,
     new_key: bool = False,
-    scopes: str | None = None,
+    scopes: Annotated[str | None, tyro.conf.arg(metavar="SCOPES")] = None,
 ) -> int:
     """Serve maps over HTTP until Ctrl-C or SIGTERM.
 
@@ -160,7 +162,7 @@ def _announce(settings: ServiceSettings, url: str) -> None:
     from splatbot.service_key import key_file
     from splatbot.services.access import Access
 
-    print(f"serving on {url}  (routes: {url}/docs, an image: {url}/v1/maps/{MAP_ID}/render)", flush=True)
+    print(f"serving on {url}  (routes: {url}/docs, an image: {url}/v1/maps/{MAP_ID}/render; Ctrl-C stops)", flush=True)
     access = Access(settings)
     if access.uses_key_file:
         key = access.shown_key(to_terminal=sys.stdout.isatty())

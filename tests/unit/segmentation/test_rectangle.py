@@ -13,7 +13,7 @@ CENTER = np.array([0.68, 0.06])
 
 
 def two_faces(yaw: float, *, noise: float = 0.0015, outliers: int = 8) -> Array:
-    """Sample two adjacent faces of a box as seen from above, points of a part of its top, and strays beyond a corner [m]."""
+    """Sample two faces of a box from above, a part of its top, and strays beyond a corner: (P, 2) [m]."""
     rng = np.random.default_rng(3)
     a = np.stack([rng.uniform(-0.5, 0.5, 900), np.full(900, -0.5)], axis=1)
     b = np.stack([np.full(900, -0.5), rng.uniform(-0.5, 0.5, 900)], axis=1)
