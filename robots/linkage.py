@@ -41,7 +41,7 @@ class SweptHand:
     """Volumes that a gripper occupies at any opening, in the frame of its flange with the fingers opening along y.
 
     Args:
-        body: what does not translate with the fingers: its housing, and the hulls of its levers over all openings.
+        body: its housing, and the hulls of its levers over all openings.
         finger: the links that translate with the pad on the side of +y, as hulls over all openings. The pad's face is
             at y = 0, and z is that of the flange: the pads of a four-bar move along z while they close.
         opening: (N,) distance between the pads at each position [m].

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import subprocess
 import sys
@@ -134,6 +135,28 @@ def test_the_snippets_of_a_client_run_against_a_service(name: str, served: str) 
             here += "ros.terminate()\n"
         done = subprocess.run([sys.executable, "-c", here], capture_output=True, text=True, timeout=120, check=False)
         assert done.returncode == 0, done.stderr
+
+
+@pytest.fixture(scope="module")
+def placed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """Address of a service of a run with a robot base."""
+    folder = tmp_path_factory.mktemp("requests")
+    run = str(folder / "run")
+    assert main(["map", "synthetic:tabletop?frames=20&width=320&height=240", "--out", run, "--quiet"]) == 0
+    assert main(["info", run, "--fit-plane", "--up", "0", "-0.867", "-0.498"]) == 0
+    with serving("--map", run, log=folder / "log.txt") as service:
+        yield service.url
+
+
+def test_each_request_of_the_guide_is_answered(placed: str) -> None:
+    text = (ROOT / "docs" / "guide" / "requests.md").read_text()
+    commands = re.findall(r"```sh\n(.*?)```", text, re.DOTALL)
+    assert len(commands) == 4
+    for command in commands:
+        here = command.replace("localhost:8000", placed.split("//")[1]).replace("curl -s", "curl -s --fail-with-body")
+        done = subprocess.run(["bash", "-c", here], capture_output=True, text=True, timeout=120, check=False)
+        assert done.returncode == 0, done.stdout + done.stderr
+        assert json.loads(done.stdout)["map_version"] == 1
 
 
 def test_every_document_with_snippets_is_run() -> None:
