@@ -50,7 +50,7 @@ class DescriptionConstants:
     most_triangles: int = 2_000_000
     slack: float = 0.02
     good_spheres: int = 256
-    most_spheres: int = 512
+    most_spheres: int = 640
     spheres_of_slack: float = 2.6
     most_pieces: int = 10_000_000
     longest_finger: int = 3

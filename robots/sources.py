@@ -58,7 +58,7 @@ SOURCES: dict[str, Source] = {
         "robotiq_2f_85 of airo-models",
         "MIT",
         {"hand": ("urdf/robotiq_2f_85.urdf", *_HOUSING, *_MESHES), "finger": ("urdf/robotiq_2f_85.urdf", *_MESHES)},
-        share={"finger": 0.6},
+        share={"finger": 0.41},
         urdf="urdf/robotiq_2f_85.urdf",
     ),
 }

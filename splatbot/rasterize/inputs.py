@@ -13,6 +13,7 @@ from splatbot.rasterize.options import DEFAULT_TILE_SIZE, parse_mode
 from splatbot.rasterize.scene import Gaussians, Viewpoints
 
 MAX_SH_DEGREE = 4
+_MOST_SKEW = 1e-2  # difference of R Rᵀ from the identity
 
 
 @dataclass(frozen=True)
@@ -208,6 +209,22 @@ def _check_cameras(viewmats: Tensor, Ks: Tensor) -> None:
                 raise InputError(f"row {i} is not finite.", field=name)
             if name == "Ks":
                 _check_intrinsics(i, row)
+            else:
+                _check_rigid(i, row)
+
+
+def _check_rigid(i: int, row: list[float]) -> None:
+    """Refuse a transform (16 numbers) that scales, shears or mirrors; a Gaussian's image would not be that of a view.
+
+    Steps of a gradient descent leave a matrix rigid within 1 %.
+    """
+    x, y, z = row[0:3], row[4:7], row[8:11]
+    products = ((x, x, 1.0), (y, y, 1.0), (z, z, 1.0), (x, y, 0.0), (y, z, 0.0), (z, x, 0.0))
+    skew = max(abs(a[0] * b[0] + a[1] * b[1] + a[2] * b[2] - want) for a, b, want in products)
+    turned = [x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0]]
+    if skew > _MOST_SKEW or turned[0] * z[0] + turned[1] * z[1] + turned[2] * z[2] <= 0.0:
+        hint = "give rigid transforms of the world to the camera; scale the scene instead"
+        raise InputError(f"row {i} scales, shears or mirrors.", field="viewmats", hint=hint)
 
 
 def _check_intrinsics(i: int, row: list[float]) -> None:

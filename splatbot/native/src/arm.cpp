@@ -44,7 +44,7 @@ double norm(const double* v) { return std::hypot(v[0], v[1], v[2]); }
 Arm::Arm(const ArmSpec& spec) {
   const std::size_t joints = spec.prismatic.size(), spheres = spec.link.size(), pairs = spec.pairs.size() / 2;
   require(joints >= 1 && joints <= kMostJoints, "an arm has 1 to 16 joints");
-  require(spheres <= kMostSpheres, "an arm has at most 512 spheres");
+  require(spheres <= kMostSpheres, "an arm has at most 640 spheres");
   require(pairs <= kMostPairs, "an arm has at most 256 pairs of links that may not touch");
   require(spec.joints.size() == 12 * joints && spec.travel.size() == joints, "joints, kinds and travel differ in number");
   require(spec.centers.size() == 3 * spheres && spec.radii.size() == spheres, "links, centres and radii differ in number");

@@ -12,7 +12,9 @@ namespace {
 
 // The parts of a finished render that a walk over the tile lists needs.
 BlendArgs finished(const RasterState& state) {
-  return list_args(const_cast<RasterState&>(state));  // read only: the kernels' structure serves writers as well
+  BlendArgs args = list_args(const_cast<RasterState&>(state));  // read only: the structure serves writers as well
+  args.transmittance_min = state.options.transmittance_min;
+  return args;
 }
 
 // A pixel's tile and its place in it, as the kernels number them.

@@ -208,3 +208,23 @@ def test_gradients_are_found_for_every_leaf_kind_of_camera() -> None:
     assert exact.Ks.grad is not None
     assert relative_l2(scene.viewmats.grad, exact.viewmats.grad) <= GRADIENT_BOUND
     assert relative_l2(scene.Ks.grad, exact.Ks.grad) <= GRADIENT_BOUND
+
+
+@pytest.mark.parametrize(
+    "change",
+    [torch.diag(torch.tensor([2.0, 2.0, 2.0])), torch.diag(torch.tensor([1.0, 1.0, -1.0])),
+     torch.tensor([[1.0, 0.3, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])],
+    ids=["scaled", "mirrored", "sheared"],
+)  # fmt: skip
+def test_a_camera_that_is_no_rigid_transform_is_refused(change: Tensor) -> None:
+    scene = hard_scene(0)
+    scene.viewmats = scene.viewmats.clone()
+    scene.viewmats[0, :3, :3] = change @ scene.viewmats[0, :3, :3]
+    with pytest.raises(InputError, match=r"viewmats: row 0 scales, shears or mirrors"):
+        scene.render("RGB")
+
+
+def test_a_camera_that_an_optimiser_left_rigid_within_a_thousandth_renders() -> None:
+    scene = hard_scene(0)
+    scene.viewmats = scene.viewmats + 3e-4
+    assert bool(scene.render("RGB")[0].isfinite().all())

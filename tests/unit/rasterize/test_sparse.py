@@ -10,6 +10,8 @@ from torch import Tensor
 
 from splatbot.errors import InputError
 from splatbot.rasterize import (
+    Gaussians,
+    Viewpoints,
     contributing_gaussians,
     rasterize_pixels,
     rasterize_tiles,
@@ -95,6 +97,21 @@ def test_contributors_are_the_front_gaussians_with_their_blend_weights(k: int) -
             assert torch.allclose(found.weights[c, p, : len(front)].double(), w[front], atol=1e-5)
             assert bool((found.ids[c, p, len(front) :] == -1).all())
             assert float(found.weights[c, p, len(front) :].abs().sum()) == 0.0
+
+
+def test_gaussians_behind_a_closed_pixel_do_not_contribute() -> None:
+    n = 50  # opacity 0.95 each: the transmittance is 1.25e-4 after three and would fall below 1e-4 at the fourth
+    gaussians = Gaussians(
+        torch.stack([torch.zeros(n), torch.zeros(n), torch.linspace(1.0, 2.0, n)], dim=1),
+        torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(n, 1),
+        torch.full((n, 3), 0.2),
+        torch.full((n,), 0.95),
+        torch.ones(n, 3),
+    )
+    K = torch.tensor([[[60.0, 0.0, 16.5], [0.0, 60.0, 16.5], [0.0, 0.0, 1.0]]])
+    found = contributing_gaussians(gaussians, Viewpoints(torch.eye(4)[None], K, 33, 33), torch.tensor([[16, 16]]), k=20)
+    assert found.ids[0, 0].tolist() == [0, 1, 2] + 17 * [-1]
+    assert found.weights[0, 0, :3].tolist() == pytest.approx([0.95, 0.95 * 0.05, 0.95 * 0.05**2], rel=1e-3)
 
 
 def test_the_weights_of_all_contributors_sum_to_alpha() -> None:

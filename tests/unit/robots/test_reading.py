@@ -85,7 +85,7 @@ def test_an_arm_with_too_many_spheres_gets_a_larger_slack_or_is_refused(tmp_path
     robot = read_description(ur5(tmp_path)).robot
     robot = replace(robot, shapes=(Capsule(6, (0.0, 0.0, 0.0), (0.0, 0.0, 2.0), 0.01),), slack=1e-4)
     assert len(robot.spheres()) > 512
-    with pytest.raises(InputError, match=r"ur5: needs \d+ spheres within 0\.1 mm, above 512"):
+    with pytest.raises(InputError, match=r"ur5: needs \d+ spheres within 0\.1 mm, above 640"):
         simplified(robot, may_grow=False)
     simple = simplified(robot, may_grow=True)
     assert len(simple.spheres()) <= 512

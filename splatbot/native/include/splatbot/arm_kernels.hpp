@@ -9,7 +9,7 @@
 
 namespace splatbot {
 
-inline constexpr int kMostJoints = 16, kMostSpheres = 512, kMostPairs = 256;
+inline constexpr int kMostJoints = 16, kMostSpheres = 640, kMostPairs = 256;
 inline constexpr int kGroupSize = 6;  // spheres in a group at most
 inline constexpr int kMostGroups = kMostSpheres / 3 + kMostJoints + 1;  // halves of 7 have 3 or more
 inline constexpr int kMostBalls = kMostSpheres + kMostGroups;
