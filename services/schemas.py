@@ -59,7 +59,7 @@ class Pose(Request):
 class HealthResponse(BaseModel):
     """Liveness or readiness of the process."""
 
-    status: Literal["ok", "ready"]
+    status: Literal["ok", "ready"] = Field(description="ok: alive; ready: answers requests")
     version: str = Field(description="of splatbot")
     unsaved: int = Field(0, description="maps whose last save failed; they are served from memory")
 
@@ -67,21 +67,21 @@ class HealthResponse(BaseModel):
 class Bounds(BaseModel):
     """Axis-aligned box around the Gaussians' centres, world frame [m]."""
 
-    low: Vector3
-    high: Vector3
+    low: Vector3 = Field(description="smallest x, y, z [m]")
+    high: Vector3 = Field(description="largest x, y, z [m]")
 
 
 class MapInfo(BaseModel):
     """A map as it is now."""
 
-    id: str
+    id: str = Field(description="name in URLs")
     map_version: int = Field(description="grows with every published state; 0: nothing yet")
-    state: Literal["static", "mapping", "ended", "failed"]
+    state: Literal["static", "mapping", "ended", "failed"] = Field(description="static: from a file")
     detail: str | None = Field(None, description="why mapping failed")
-    source: str
-    gaussians: int
-    bytes: int
-    sh_degree: int
+    source: str = Field(description="file, log or camera of the map")
+    gaussians: int = Field(description="number of Gaussians")
+    bytes: int = Field(description="memory of the Gaussians")
+    sh_degree: int = Field(description="degree of the spherical harmonics of colours, 0..4")
     stamp: float = Field(description="time of the last frame in the map [s]")
     bounds: Bounds | None = Field(None, description="null while the map is empty")
 
@@ -89,7 +89,7 @@ class MapInfo(BaseModel):
 class MapList(BaseModel):
     """All maps."""
 
-    maps: list[MapInfo]
+    maps: list[MapInfo] = Field(description="all maps")
 
 
 class MapRequest(Request):
@@ -114,18 +114,18 @@ class DistanceRequest(Request):
 class CameraIn(Request):
     """Pinhole intrinsics [px]; integer coordinates are pixel centres, as in OpenCV."""
 
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    width: int
-    height: int
+    fx: float = Field(description="focal length along x [px]")
+    fy: float = Field(description="focal length along y [px]")
+    cx: float = Field(description="principal point, column [px]")
+    cy: float = Field(description="principal point, row [px]")
+    width: int = Field(description="columns of the image [px]")
+    height: int = Field(description="rows of the image [px]")
 
 
 class RenderRequest(Request):
     """A view to be drawn. The pose is a matrix, or a translation and a quaternion, or left out for the default view."""
 
-    mode: Mode = "rgb"
+    mode: Mode = Field("rgb", description="quantity that the image shows")
     camera: CameraIn | None = Field(None, description="default: 640x480 pixels, 60 degrees wide")
     T_world_camera: tuple[Vector4, Vector4, Vector4, Vector4] | None = Field(None, description="(4, 4), row by row")
     translation: Vector3 | None = Field(None, description="camera centre, world frame [m]")
@@ -144,15 +144,15 @@ class RenderRequest(Request):
 class ViewIn(Request):
     """One camera of a batch."""
 
-    camera: CameraIn
+    camera: CameraIn = Field(description="pinhole intrinsics")
     pose: Pose = Field(description="T_world_camera")
 
 
 class ViewsRequest(Request):
     """Several views at once, as a policy with several cameras needs them."""
 
-    views: list[ViewIn] = Field(min_length=1)
-    modes: list[Mode] = Field(["rgb"], min_length=1, max_length=4)
+    views: list[ViewIn] = Field(min_length=1, description="cameras and their poses")
+    modes: list[Mode] = Field(["rgb"], min_length=1, max_length=4, description="quantities of each view")
 
 
 class CollisionsRequest(Request):
@@ -170,12 +170,12 @@ class IkRequest(Request):
     """A pose of the tool to be reached."""
 
     pose: Pose = Field(description="T_base_tcp, or T_world_tcp with `map`")
-    robot: str = "panda"
+    robot: str = Field("panda", description="robot, as `splatbot robot list` names it")
     near: list[float] | None = Field(None, description="posture to stay near [rad or m]; default: home")
-    seeds: Annotated[int, Field(ge=1, le=256)] = 32
+    seeds: Annotated[int, Field(ge=1, le=256)] = Field(32, description="random starts of the search")
     map: str | None = Field(None, description="keep only solutions that are free in this map")
     base: Pose | None = Field(None, description="T_world_base; by default that of the map")
-    margin: Annotated[float, Field(ge=0, le=MOST_MARGIN_M)] = 0.0
+    margin: Annotated[float, Field(ge=0, le=MOST_MARGIN_M)] = Field(0.0, description="room to keep to the map [m]")
 
 
 class PlanRequest(Request):
@@ -186,7 +186,7 @@ class PlanRequest(Request):
     start: list[float] | None = Field(None, description="(J,) [rad or m]; default: the robot's home")
     goal: list[float] | None = Field(None, description="(J,) [rad or m]")
     goal_pose: Pose | None = Field(None, description="T_base_tcp")
-    robot: str = "panda"
+    robot: str = Field("panda", description="robot, as `splatbot robot list` names it")
     base: Pose | None = Field(None, description="T_world_base; by default that of the map")
     margin: Annotated[float, Field(ge=0, le=MOST_MARGIN_M, strict=True)] | Literal["auto"] | None = Field(
         None,
@@ -197,7 +197,7 @@ class PlanRequest(Request):
         0.999, description='share of the confirmed surface that the margin "auto" covers'
     )
     budget_ms: Annotated[float, Field(gt=0, allow_inf_nan=False)] = Field(100.0, description="time to plan")
-    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = Field(0, description="seed of the search")
     speed: Annotated[float, Field(gt=0, le=1)] = Field(
         DEFAULT_SPEED,
         description="fraction of the joints' limits of velocity and acceleration; 1 is as fast as the arm can",
@@ -212,7 +212,7 @@ class PictureHint(Request):
 
     one_of = ("pixel", "box")
 
-    camera: CameraIn
+    camera: CameraIn = Field(description="pinhole intrinsics of the picture")
     pose: Pose = Field(description="T_world_camera")
     pixel: tuple[float, float] | None = Field(None, description="(u, v) [px]")
     box: Vector4 | None = Field(None, description="(u0, v0, u1, v1) [px]")
@@ -225,25 +225,25 @@ class GraspsRequest(Request):
 
     target: str | None = Field(None, max_length=200, description='words, as "largest box" or "red cup"')
     point: Vector3 | None = Field(None, description="on or in the object, world frame [m]")
-    picture: PictureHint | None = None
-    robot: str = "panda"
+    picture: PictureHint | None = Field(None, description="place of the object in an image")
+    robot: str = Field("panda", description="robot, as `splatbot robot list` names it")
     base: Pose | None = Field(None, description="T_world_base, z up; by default that of the map")
     hand_only: bool = Field(False, description="leave the arm out")
-    approach: Literal["any", "top", "side"] = "any"
+    approach: Literal["any", "top", "side"] = Field("any", description="direction of the approach")
     min_confidence: Annotated[float, Field(ge=0, le=1)] = Field(
         0.5, description="least probability of success of a grasp, as simulated trials calibrate it"
     )
     accept_implied: bool = Field(False, description="offer grasps of which no contact is at measured depth")
-    friction: Annotated[float, Field(gt=0, le=2)] = 0.5
+    friction: Annotated[float, Field(gt=0, le=2)] = Field(0.5, description="coefficient between pads and object")
     samples: Annotated[int, Field(ge=10, le=5000)] = Field(
         400, description="places tried, four times as many with sharper rims where that finds nothing: the knob of time"
     )
-    wanted: Annotated[int, Field(ge=1, le=100)] = 10
+    wanted: Annotated[int, Field(ge=1, le=100)] = Field(10, description="largest number of grasps")
     margin: Annotated[float, Field(ge=0, le=1)] = Field(0.0, description="room to keep from the rest [m]")
     min_observations: Annotated[int, Field(ge=1, le=1000)] = Field(
         1, description="least number of keyframes of a Gaussian"
     )
-    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = Field(0, description="seed of the search")
 
 
 class PicksRequest(Request):
@@ -284,15 +284,15 @@ class LeaseInfo(BaseModel):
     """A lease of an arm."""
 
     lease: str = Field(description="motions name it; keep it secret")
-    arm: str
+    arm: str = Field(description="name of the arm")
     seconds: float = Field(description="renew it within this time: PUT /v1/leases/LEASE [s]")
 
 
 class StopInfo(BaseModel):
     """State of the emergency stop."""
 
-    stopped: bool
-    by: str | None = None
+    stopped: bool = Field(description="whether all arms are stopped")
+    by: str | None = Field(None, description="client that stopped them")
     since: float | None = Field(None, description="Unix time [s]")
 
 
@@ -303,7 +303,7 @@ class TrialsRequest(Request):
     map: str | None = Field(None, description="instead: a map of this service, as the shapes that physics takes it for")
     base: Pose | None = Field(None, description="T_world_base in the map; default: the map's own")
     plan: str | None = Field(None, description="id of a plan to follow; default: the scene's own moves")
-    trials: Annotated[int, Field(ge=1, le=100)] = 1
+    trials: Annotated[int, Field(ge=1, le=100)] = Field(1, description="number of trials")
     seed: Annotated[int, Field(ge=0, lt=2**31)] = Field(0, description="of the first trial; 0 displaces nothing")
     force: list[str] = Field([], max_length=32, description="effects enabled in any case")
     forbid: list[str] = Field([], max_length=32, description="effects that are disabled")
@@ -312,18 +312,18 @@ class TrialsRequest(Request):
 class JobInfo(BaseModel):
     """A job as it stands."""
 
-    id: str
-    kind: str
-    state: Literal["queued", "running", "succeeded", "failed", "cancelled"]
+    id: str = Field(description="name in URLs")
+    kind: str = Field(description="map, pick or trials")
+    state: Literal["queued", "running", "succeeded", "failed", "cancelled"] = Field(description="state of the job")
     progress: float = Field(description="0..1")
-    detail: str | None
-    result: dict[str, Any] | None
+    detail: str | None = Field(description="current step, or the error")
+    result: dict[str, Any] | None = Field(description="result of a job that succeeded")
     created: float = Field(description="Unix time [s]")
-    started: float | None
-    ended: float | None
+    started: float | None = Field(description="Unix time [s]; null while it waits")
+    ended: float | None = Field(description="Unix time [s]; null until it ends")
 
 
 class JobList(BaseModel):
     """All jobs, the oldest first."""
 
-    jobs: list[JobInfo]
+    jobs: list[JobInfo] = Field(description="all jobs")

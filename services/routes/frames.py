@@ -36,7 +36,7 @@ class FrameRequest(Body):
     """
 
     stamp: float = Field(allow_inf_nan=False, description="[s]; later than the frame before, by at most a day")
-    camera: CameraIn
+    camera: CameraIn = Field(description="pinhole intrinsics of both images")
     rgb: Any = Field(description="PNG or JPEG, or array")
     depth: Any = Field(description="16-bit PNG, or array; 0 where it is not known")
     depth_scale: float = Field(1000.0, gt=0, allow_inf_nan=False, description="units per metre of an integer depth")

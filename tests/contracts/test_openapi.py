@@ -67,3 +67,16 @@ def test_two_thousand_generated_requests_meet_no_fault_and_errors_are_problems(a
         ask()
     assert asked >= CASES
     assert {200, 422} <= statuses
+
+
+def test_every_field_of_every_body_is_described(service: Service) -> None:
+    schemas = service.client.get("/openapi.json").json()["components"]["schemas"]
+    own = {name: schema for name, schema in schemas.items() if "Validation" not in name}
+    assert len(own) > 20
+    missing = [
+        f"{name}.{field}"
+        for name, schema in own.items()
+        for field, value in schema.get("properties", {}).items()
+        if not value.get("description")
+    ]
+    assert not missing
