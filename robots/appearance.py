@@ -39,6 +39,16 @@ def appearance(robot: RobotModel, opening: float | None = None) -> list[DrawnPar
     Raises:
         FormatError: the stored meshes are damaged.
     """
+    parts, fingers = links_and_finger(robot)
+    return parts + [part for piece in fingers for part in _fingers(robot, piece.triangles, piece.color, opening)]
+
+
+def links_and_finger(robot: RobotModel) -> tuple[list[DrawnPart], list[DrawnPart]]:
+    """Return the parts of a robot's links, and those of one finger in its own frame.
+
+    Raises:
+        FormatError: the stored meshes are damaged.
+    """
     last, meshes = len(robot), _panda_meshes() if _has_panda_arm(robot) else {}
     parts = [replace(piece, link=k) for k in range(last + 1) for piece in meshes.get(f"link{k}", ())]
     if robot is panda():
@@ -46,22 +56,22 @@ def appearance(robot: RobotModel, opening: float | None = None) -> list[DrawnPar
             replace(piece, link=last, triangles=transform_points(T_LINK_HAND, piece.triangles))
             for piece in meshes["hand"]
         ]
-        fingers = ((piece.triangles, piece.color) for piece in meshes["finger"])
-        return parts + [part for triangles, color in fingers for part in _fingers(robot, triangles, color, opening)]
+        return parts, meshes["finger"]
     parts += [DrawnPart(mesh.link, mesh.triangles(), _LIGHT) for mesh in robot.visual]
     arm = {part.link for part in parts}
     parts += [
         DrawnPart(shape.link, shape.triangles(), _DARK) for shape in robot.shapes if shape.link not in arm - {last}
     ]
+    fingers: list[DrawnPart] = []
     if robot.gripper is not None and robot.gripper.shapes:
-        own = np.concatenate([shape.triangles() for shape in robot.gripper.shapes])
-        parts += _fingers(robot, own, _DARK, opening)
-    drawn, spheres = {part.link for part in parts}, robot.spheres(opening)
-    return parts + [
+        fingers = [DrawnPart(0, np.concatenate([shape.triangles() for shape in robot.gripper.shapes]), _DARK)]
+    drawn, spheres = {part.link for part in parts} | ({last} if fingers else set()), robot.spheres()
+    balls = [
         DrawnPart(int(link), np.asarray(center + radius * _ball()), _LIGHT)
         for link, center, radius in zip(spheres.link, spheres.centers, spheres.radii, strict=True)
         if link not in drawn
     ]
+    return parts + balls, fingers
 
 
 def coarse_appearance(robot: RobotModel, most: int = 250) -> list[DrawnPart]:

@@ -13,7 +13,7 @@ from splatbot.camera import Camera
 from splatbot.errors import NativeError
 from splatbot.protocols import Array
 from splatbot.sim.view import TwinView
-from splatbot.sim.world import MAP_GROUP, World
+from splatbot.sim.world import BODY_GROUP, MAP_GROUP, World
 
 
 @dataclass(frozen=True)
@@ -57,6 +57,8 @@ class BodiesView:
         self._far = CONSTANTS.background * float(m.vis.map.zfar * m.stat.extent)
         self._shown = mujoco.MjvOption()
         self._shown.geomgroup[MAP_GROUP] = int(map_too)
+        self._shown.geomgroup[BODY_GROUP] = 0
+        self._own = mujoco.MjData(m) if world.for_views else None
         self._shown.sitegroup[:] = 0  # markers such as that of the tool, which a real camera does not see
         try:
             self._renderer = mujoco.Renderer(m, height, width)
@@ -90,7 +92,17 @@ class BodiesView:
         """Release the rendering context."""
         self._renderer.close()
 
+    def _posed(self, own: Any, data: Any) -> Any:
+        """Return data of a world for views at the positions of the simulated one."""
+        own.qpos[:], own.mocap_pos[:], own.mocap_quat[:] = data.qpos, data.mocap_pos, data.mocap_quat
+        m = self._renderer.model
+        for place in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_camlight, mujoco.mj_flex):
+            place(m, own)
+        return own
+
     def _aim(self, data: Any, T: Array) -> None:
+        if self._own is not None:
+            data = self._posed(self._own, data)
         self._renderer.update_scene(data, scene_option=self._shown)
         c = self.camera
         for eye in self._renderer.scene.camera:  # a stereo pair that MuJoCo averages

@@ -25,6 +25,7 @@ OBJECT = "object/"
 CAMERA = "camera"
 MAP = "map"
 MAP_GROUP = 2  # of the map's collision geometry, which rendering can hide
+BODY_GROUP = 5  # of the robot's collision geometry in a world for views
 _MOVABLE_MASS = 0.2  # [kg]
 
 
@@ -65,6 +66,7 @@ class World:
         mounted: pairs (link, object) that overlap at home, whose contacts are excluded.
         parts: collision geometry of the map. If None, there is no map.
         notes: on that conversion.
+        for_views: whether the model has the robot's meshes for views, see :func:`splatbot.sim.dressing.dressed`.
     """
 
     scene: Scene
@@ -78,6 +80,7 @@ class World:
     mounted: tuple[tuple[str, str], ...] = ()
     parts: MapParts | None = None
     notes: tuple[str, ...] = ()
+    for_views: bool = False
 
     @property
     def on(self) -> tuple[str, ...]:
@@ -121,7 +124,7 @@ def build_world(scene: Scene, *, robot: RobotModel | None = None, timestep: floa
     if mounted:
         model = _compiled(draft)
     hooks = [effect.hook(model, scene) for effect in on]
-    owner, of_robot = _owners(model)
+    owner, of_robot = owners_of(model)
     return World(
         scene, draft.robot, draft.spec, model, decisions, tuple(h for h in hooks if h is not None), owner, of_robot,
         mounted, parts, _notes(parts, mounted),
@@ -243,7 +246,8 @@ def _geoms(body: Any) -> range:
     return range(int(body.geomadr[0]), int(body.geomadr[0]) + int(body.geomnum[0]))
 
 
-def _owners(model: Any) -> tuple[tuple[str, ...], NDArray[np.bool_]]:
+def owners_of(model: Any) -> tuple[tuple[str, ...], NDArray[np.bool_]]:
+    """Return the owner of each geom, and whether it belongs to the robot, as in :class:`World`."""
     names = [str(model.body(int(body)).name) for body in model.geom_bodyid]
     robot = np.array([not name.startswith(OBJECT) and name != "world" for name in names], dtype=np.bool_)
     return tuple(_owner(name) for name in names), robot

@@ -23,6 +23,7 @@ from splatbot.sim.camera import TwinCamera
 from splatbot.sim.compare.held_out import HeldOutTwin, Spread, draw
 from splatbot.sim.contact_monitor import ContactMonitor
 from splatbot.sim.controller import TwinController
+from splatbot.sim.dressing import dressed
 from splatbot.sim.trials.scan import TrialScan, UnseenError, scan_scene
 from splatbot.sim.trials.scenes import TABLE, TrialScene
 from splatbot.sim.trials.shake import Shake
@@ -247,7 +248,7 @@ def held_out_twin(trial: TrialScene) -> HeldOutTwin:
 def _film(decision: StackDecision, trial: TrialScene, path: Path) -> None:
     """Record the pick in the held-out twin again, with a camera."""
     twin = held_out_twin(trial)
-    video = Video(path, TwinCamera(twin.world, seed=trial.seed))
+    video = Video(path, TwinCamera(dressed(twin.world), seed=trial.seed))
     try:
         attempt(decision, trial, twin, watch=video)
     finally:

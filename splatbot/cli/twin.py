@@ -134,9 +134,10 @@ def _film(path: Path | None, world: Any, seed: int) -> Iterator[Any]:
         yield None
         return
     from splatbot.sim.camera import TwinCamera
+    from splatbot.sim.dressing import dressed
     from splatbot.sim.video import Video
 
-    video = Video(path, TwinCamera(world, seed=seed))
+    video = Video(path, TwinCamera(dressed(world), seed=seed))
     try:
         yield video
     finally:
