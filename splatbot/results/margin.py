@@ -35,6 +35,8 @@ class RunMarginConstants:
     region: float = 0.2
     """Distance [m] of the arm's sphere centers within which points belong to the region of a motion. A larger one
     averages over more surface."""
+    cell: float = 0.02
+    """Edge [m] of the cells of which one center each bounds the distances, before the exact search among few points."""
 
 
 CONSTANTS = RunMarginConstants()
@@ -61,12 +63,22 @@ class AuditedError:
 
         If fewer than ``least`` points are there, the nearest ``least`` points are returned.
         """
-        tree = cKDTree(np.asarray(centers, dtype=np.float64).reshape(-1, 3))
-        inside = np.isfinite(tree.query(self.points, distance_upper_bound=distance)[0])
-        if np.count_nonzero(inside) < least:  # rare, and slower without a bound
-            gap = tree.query(self.points)[0]
-            inside = gap <= (np.partition(gap, least - 1)[least - 1] if least <= len(gap) else np.inf)
-        return AuditedError(self.points[inside], self.error[inside])
+        all_centers = np.asarray(centers, dtype=np.float64).reshape(-1, 3)
+        least = min(least, len(self.points))
+        # One centre of each cell bounds the distance: not below it, and above it by at most the cell's diagonal.
+        cell = CONSTANTS.cell
+        cells = np.floor(all_centers / cell).astype(np.int64) @ [1, 1 << 20, 1 << 40]
+        some = all_centers[np.unique(cells, return_index=True)[1]]
+        most = cKDTree(some).query(self.points)[0]
+        reach = max(distance, float(np.partition(most, least - 1)[least - 1]) if least else 0.0)
+        near = np.flatnonzero(most <= reach + np.sqrt(3.0) * cell)
+        gap = cKDTree(all_centers).query(self.points[near], distance_upper_bound=np.nextafter(reach, np.inf))[0]
+        if np.count_nonzero(gap <= distance) >= least:
+            reach = distance
+        else:
+            reach = float(np.partition(gap, least - 1)[least - 1])
+        chosen = near[gap <= reach]
+        return AuditedError(self.points[chosen], self.error[chosen])
 
     def quantile(self, confidence: float) -> float:
         """Return an error [m] that a fraction ``confidence`` (0..1) of the points does not exceed; 0 without points.

@@ -83,3 +83,16 @@ def test_the_region_of_a_motion_grows_to_the_nearest_points_until_it_has_enough(
 def test_a_region_without_any_point_has_no_error() -> None:
     empty = AuditedError(np.zeros((0, 3)), np.zeros(0))
     assert empty.near(np.zeros((1, 3)), 0.2, 5).quantile(0.999) == 0.0
+
+
+@pytest.mark.parametrize(("distance", "least"), [(0.05, 0), (0.2, 50), (0.05, 400), (0.01, 3000), (0.5, 5000)])
+def test_near_points_are_those_of_an_exhaustive_search(distance: float, least: int) -> None:
+    rng = np.random.default_rng(least)
+    points, centers = rng.uniform(-1, 1, (3000, 3)), rng.uniform(-0.3, 0.3, (2000, 3)) * [1.0, 0.1, 0.1]
+    audited = AuditedError(points, rng.uniform(0, 0.01, 3000))
+    gap = np.linalg.norm(points[:, None] - centers, axis=2).min(axis=1)
+    most = max(distance, np.sort(gap)[min(least, 3000) - 1] if least else 0.0)
+    want = gap <= most if (gap <= distance).sum() < least else gap <= distance
+    found = audited.near(centers, distance, least)
+    np.testing.assert_array_equal(found.points, points[want])
+    np.testing.assert_array_equal(found.error, audited.error[want])
