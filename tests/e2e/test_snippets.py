@@ -148,6 +148,7 @@ def placed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         yield service.url
 
 
+@pytest.mark.long
 def test_each_request_of_the_guide_is_answered(placed: str) -> None:
     text = (ROOT / "docs" / "guide" / "requests.md").read_text()
     commands = re.findall(r"```sh\n(.*?)```", text, re.DOTALL)

@@ -49,9 +49,8 @@ def test_the_robot_has_meshes_and_the_world_of_the_physics_stays(name: str) -> N
     assert not world.model.geom_contype[meshes].any()
 
 
-@pytest.mark.parametrize("name", ["mug_hanging", "soft_object"])
-def test_the_meshes_are_seen_where_the_simulated_robot_is(name: str) -> None:
-    both, pixels = run_drawing(_MASKS % name)
+def test_the_meshes_are_seen_where_the_simulated_robot_is() -> None:
+    both, pixels = run_drawing(_MASKS % "mug_hanging")
     assert float(both) > 0.65  # the collision geometry is wider than the meshes
     assert int(pixels) > 1000
 
