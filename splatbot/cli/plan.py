@@ -159,12 +159,15 @@ def _unknown_solids(
 
 def _refuse_unknown(result: PlanResult, gaussians: int) -> None:
     """Raise an error if unknown space, which follows the map's Gaussians, makes a start or goal invalid."""
+    from splatbot.planning import PlanStatus
+
+    ends = {PlanStatus.START_STATE_IN_COLLISION: "start", PlanStatus.GOAL_IN_COLLISION: "goal"}
     cause = result.cause
-    if result.path is not None or cause is None or cause.gaussian < gaussians:
+    if result.status not in ends or cause is None or cause.gaussian < gaussians:
         return
     raise SplatbotError(
         f"link {cause.link} is {1e3 * cause.depth:.1f} mm deep in space that no frame saw to be empty.",
-        field=result.status.name.lower(),
+        field=ends[result.status],
         hint="map the place from more views, give another goal, or plan with --unknown free",
     )
 

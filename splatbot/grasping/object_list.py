@@ -87,7 +87,7 @@ def list_objects(scene: SegmentedMap, robot: RobotKinematics) -> tuple[ListedObj
                 at,
                 len(item.rows),
                 not size,
-                size or _too_far(at - float(np.linalg.norm(item.size)) / 2 * at / np.linalg.norm(at), robot),
+                size or _too_far(at, float(np.linalg.norm(item.size)) / 2, robot),
             )
         )
     several = {label for label, count in Counter(o.label for o in found).items() if count > 1}
@@ -118,8 +118,8 @@ def stroke_of(robot: RobotKinematics) -> float:
     return hand.stroke if hand is not None else 0.0
 
 
-def _too_far(nearest: Array, robot: RobotKinematics) -> str:
-    """Return the reason why an arm cannot reach a point (3,) [m, base frame], or "".
+def _too_far(center: Array, radius: float, robot: RobotKinematics) -> str:
+    """Return the reason why an arm cannot reach a ball around a point (3,) [m, base frame], or "".
 
     The tool is at most as far from the first joint as all links in line, which the postures of a grasp are not.
     """
@@ -128,7 +128,10 @@ def _too_far(nearest: Array, robot: RobotKinematics) -> str:
     chain = robot.chain
     steps = np.linalg.norm(np.r_[chain.T_before_joint[1:, :3, 3], robot.T_link_tcp[None, :3, 3]], axis=1)
     travel = np.maximum(np.abs(chain.lower), np.abs(chain.upper))[chain.prismatic]
-    reach, away = float(steps.sum() + travel.sum()), float(np.linalg.norm(nearest - chain.T_before_joint[0, :3, 3]))
+    reach, away = (
+        float(steps.sum() + travel.sum()),
+        float(np.linalg.norm(center - chain.T_before_joint[0, :3, 3])) - radius,
+    )
     if away <= reach:
         return ""
     return f"it is {away:.2f} m from the first joint, and the arm reaches {reach:.2f} m"
