@@ -20,7 +20,7 @@ from tests.e2e.real_grasps import check_lying_box, check_shelf_box, check_tape_r
 # adjustment and held-out views check the third (docs/experiments/tracking.md, "Keypoints from the whole image").
 LOGS = [
     pytest.param("arm_wrist_48", 48, 0.004, id="arm_wrist_48", marks=pytest.mark.long),
-    pytest.param("apc_shelf_robot", 15, 0.025, id="apc_shelf_robot"),
+    pytest.param("apc_shelf_robot", 15, 0.025, id="apc_shelf_robot", marks=pytest.mark.long),
     pytest.param("visp_tabletop", 99, 0.025, id="visp_tabletop", marks=pytest.mark.long),
     pytest.param("redkitchen_000_199", 200, 0.015, id="redkitchen_000_199", marks=pytest.mark.long),
 ]

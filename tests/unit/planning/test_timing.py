@@ -173,6 +173,7 @@ def test_a_path_that_is_not_free_is_timed_and_said_not_to_be(arm: RobotSpheres, 
     _within_limits(trajectory)
 
 
+@pytest.mark.long
 def test_no_sphere_is_farther_from_the_chords_than_stated(arm: RobotSpheres, field: GaussianCollisionField) -> None:
     for path in free_paths(arm, field, 2, 6):
         trajectory = time_path(path, arm, field)
