@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from splatbot.errors import InputError
-from splatbot.protocols import Array
+from splatbot.protocols import Array, KinematicChain
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,3 +43,17 @@ class Joint:
             raise InputError(
                 f"has limits {limits}.", field=self.name, hint="give finite limits with lower <= upper and rates >= 0"
             )
+
+
+def chain_of(joints: Sequence[Joint]) -> KinematicChain:
+    """Return the kinematic chain of an arm's joints, from the base outwards."""
+
+    def column(name: str) -> Array:
+        return np.array([getattr(joint, name) for joint in joints], dtype=np.float64)
+
+    return KinematicChain(
+        tuple(joint.name for joint in joints),
+        np.array([joint.T_before_joint for joint in joints]),
+        np.array([joint.prismatic for joint in joints]),
+        *(column(name) for name in ("lower", "upper", "velocity", "acceleration", "jerk", "effort")),
+    )

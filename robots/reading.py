@@ -12,7 +12,7 @@ from splatbot.errors import FormatError, InputError
 from splatbot.geometry import so3_exp
 from splatbot.protocols import Array
 from splatbot.robots.cover import proof_size
-from splatbot.robots.joints import Joint
+from splatbot.robots.joints import Joint, chain_of
 from splatbot.robots.robot import RobotModel
 from splatbot.robots.shapes import Shape
 
@@ -137,18 +137,6 @@ def default_tip(children: Mapping[str, Sequence[str]], moving: Iterable[str], ro
         at = branches[0]
 
 
-def reach_of(joints: Sequence[Joint], T_link_tcp: Array) -> float:
-    """Return the distance [m] from the first joint to the tool when all links are in line: an upper bound.
-
-    Args:
-        joints: of the arm.
-        T_link_tcp: (4, 4) pose of the tool on the last link [m].
-    """
-    steps = [j.T_before_joint[:3, 3] for j in joints[1:]] + [T_link_tcp[:3, 3]]
-    travel = sum(max(abs(j.lower), abs(j.upper)) for j in joints if j.prismatic)
-    return float(sum(np.linalg.norm(step) for step in steps) + travel)
-
-
 def distinct(shapes: Iterable[NamedShape]) -> list[NamedShape]:
     """Drop meshes that stand twice on a link, as visual and as collision geometry."""
     found: list[NamedShape] = []
@@ -190,7 +178,7 @@ def checked_slack(
         FormatError: a size is implausible, or the surface is too large for the slack.
     """
     _check_sizes(shapes, joints, T_link_tcp, file)
-    chosen = CONSTANTS.slack * max(reach_of(joints, T_link_tcp), 0.05) if slack is None else slack
+    chosen = CONSTANTS.slack * max(chain_of(joints).reach(T_link_tcp), 0.05) if slack is None else slack
     _check_work(shapes, chosen, file)
     return chosen
 
@@ -226,7 +214,7 @@ def _check_sizes(shapes: Sequence[NamedShape], joints: Sequence[Joint], T_link_t
     Raises:
         FormatError: a size is implausible, or the meshes have too many triangles.
     """
-    reach = reach_of(joints, T_link_tcp)
+    reach = chain_of(joints).reach(T_link_tcp)
     triangles, longest = 0, 0.0
     for named in shapes:
         corners = named.shape.triangles()

@@ -13,7 +13,7 @@ from splatbot.errors import InputError
 from splatbot.geometry import inverse, transform_points
 from splatbot.protocols import Array, HandShape, KinematicChain, LinkSpheres
 from splatbot.robots.cover import cover
-from splatbot.robots.joints import Joint
+from splatbot.robots.joints import Joint, chain_of
 from splatbot.robots.shapes import Mesh, Shape
 
 
@@ -132,16 +132,7 @@ class RobotModel:
     @cached_property
     def chain(self) -> KinematicChain:
         """Joints and their limits."""
-
-        def column(name: str) -> Array:
-            return np.array([getattr(joint, name) for joint in self.joints], dtype=np.float64)
-
-        return KinematicChain(
-            tuple(joint.name for joint in self.joints),
-            np.array([joint.T_before_joint for joint in self.joints]),
-            np.array([joint.prismatic for joint in self.joints]),
-            *(column(name) for name in ("lower", "upper", "velocity", "acceleration", "jerk", "effort")),
-        )
+        return chain_of(self.joints)
 
     def fk(self, q: ArrayLike) -> Array:
         """Compute the poses T_base_link (..., J + 1, 4, 4) of all links at configurations (..., J) [rad or m]."""

@@ -42,6 +42,16 @@ class KinematicChain:
     def __len__(self) -> int:
         return len(self.names)
 
+    def reach(self, T_link_tcp: Array) -> float:
+        """Return the distance [m] from the first joint to the tool when all links are in line: an upper bound.
+
+        Args:
+            T_link_tcp: (4, 4) pose of the tool on the last link [m].
+        """
+        steps = np.concatenate([self.T_before_joint[1:, :3, 3], np.asarray(T_link_tcp)[None, :3, 3]])
+        travel = np.maximum(np.abs(self.lower), np.abs(self.upper))[self.prismatic]
+        return float(np.linalg.norm(steps, axis=1).sum() + travel.sum())
+
 
 @dataclass(frozen=True, eq=False)
 class LinkSpheres:

@@ -120,7 +120,7 @@ def plan(
         speed=speed,
     )
     result, trajectory = found.result, found.trajectory
-    _refuse_unknown(result, len(model))
+    _refuse_unknown(result, len(model), unknown)
     result.unwrap()
     assert trajectory is not None
     covers = found.scope(n_sigma=n_sigma, unknown=unknown, confidence=confidence)
@@ -157,7 +157,13 @@ def _unknown_solids(
     return lambda margin: obstacles(space, policy, spheres, here, margin=margin) or None
 
 
-def _refuse_unknown(result: PlanResult, gaussians: int) -> None:
+_UNKNOWN_SPACE = {
+    "cautious": "space in which two frames looked and measured no depth",
+    "occupied": "space that no frame saw to be empty",
+}
+
+
+def _refuse_unknown(result: PlanResult, gaussians: int, policy: UnknownPolicy) -> None:
     """Raise an error if unknown space, which follows the map's Gaussians, makes a start or goal invalid."""
     from splatbot.planning import PlanStatus
 
@@ -166,7 +172,7 @@ def _refuse_unknown(result: PlanResult, gaussians: int) -> None:
     if result.status not in ends or cause is None or cause.gaussian < gaussians:
         return
     raise SplatbotError(
-        f"link {cause.link} is {1e3 * cause.depth:.1f} mm deep in space that no frame saw to be empty.",
+        f"link {cause.link} is {1e3 * cause.depth:.1f} mm deep in {_UNKNOWN_SPACE[policy]}.",
         field=ends[result.status],
         hint="map the place from more views, give another goal, or plan with --unknown free",
     )
@@ -261,6 +267,7 @@ def _print(result: PlanResult, trajectory: JointTrajectory, covers: dict[str, An
         ("clearance", clearance_text(c)),
         ("covers", f"moving links against the map at {covers['n_sigma']:g} sigma and against the arm itself"),
         ("base", _BASE_IN_MAP if covers["base_in_map"] else "not covered: the mounted link is not checked"),
+        ("hand", "covered" if covers["hand"] else "not covered: this robot has none; see `splatbot robot list`"),
         ("unknown space", _UNKNOWN[covers["unknown_space"]]),
         ("margin", _margin_text(covers)),
         ("written to", str(folder)),

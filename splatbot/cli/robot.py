@@ -122,8 +122,10 @@ def _check_meshes(name: str, out: Path | None) -> int:
     """Print containment and slack of each part; return 1 if a part is not contained."""
     from splatbot.cli.tables import print_table, print_text
     from splatbot.robots.bodies.check import check_parts, draw_parts
+    from splatbot.robots.hands import HAND_NAMES
 
-    arm, _, hand = name.partition("-")
+    arm, _, suffix = name.partition("-")
+    arm, hand = (arm, suffix) if suffix in HAND_NAMES else (name, "")
     parts, title = _arm_parts(arm, own_hand=not hand)
     if hand:
         of_hand, hand_title = _hand_parts(hand)

@@ -139,9 +139,9 @@ def confirmed_near(
     T = np.eye(4) if T_world_box is None else T_world_box
     found, owners = [np.zeros((0, 3))], [np.zeros(0, np.int64)]
     for number, (depth, camera, T_world_camera) in enumerate(views):
-        row, column = _pixels_in_box(depth, low, high, camera, inverse(T) @ T_world_camera)
-        z = depth[row, column].astype(np.float64)
-        local = _lifted(column, row, z, camera, inverse(T) @ T_world_camera)
+        T_box_camera = inverse(T) @ T_world_camera
+        row, column = _pixels_in_box(depth, low, high, camera, T_box_camera)
+        local = _lifted(column, row, depth[row, column].astype(np.float64), camera, T_box_camera)
         chosen = np.asarray(((local > low) & (local < high)).all(axis=1))
         if inside is not None:
             chosen[chosen] = inside(local[chosen])

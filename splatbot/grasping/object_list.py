@@ -125,13 +125,8 @@ def _too_far(center: Array, radius: float, robot: RobotKinematics) -> str:
     """
     if not isinstance(robot, HasHand):
         return ""
-    chain = robot.chain
-    steps = np.linalg.norm(np.r_[chain.T_before_joint[1:, :3, 3], robot.T_link_tcp[None, :3, 3]], axis=1)
-    travel = np.maximum(np.abs(chain.lower), np.abs(chain.upper))[chain.prismatic]
-    reach, away = (
-        float(steps.sum() + travel.sum()),
-        float(np.linalg.norm(center - chain.T_before_joint[0, :3, 3])) - radius,
-    )
+    reach = robot.chain.reach(robot.T_link_tcp)
+    away = float(np.linalg.norm(center - robot.chain.T_before_joint[0, :3, 3])) - radius
     if away <= reach:
         return ""
     return f"it is {away:.2f} m from the first joint, and the arm reaches {reach:.2f} m"

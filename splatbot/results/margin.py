@@ -73,11 +73,8 @@ class AuditedError:
         reach = max(distance, float(np.partition(most, least - 1)[least - 1]) if least else 0.0)
         near = np.flatnonzero(most <= reach + np.sqrt(3.0) * cell)
         gap = cKDTree(all_centers).query(self.points[near], distance_upper_bound=np.nextafter(reach, np.inf))[0]
-        if np.count_nonzero(gap <= distance) >= least:
-            reach = distance
-        else:
-            reach = float(np.partition(gap, least - 1)[least - 1])
-        chosen = near[gap <= reach]
+        few = np.count_nonzero(gap <= distance) < least
+        chosen = near[gap <= (np.partition(gap, least - 1)[least - 1] if few else distance)]
         return AuditedError(self.points[chosen], self.error[chosen])
 
     def quantile(self, confidence: float) -> float:

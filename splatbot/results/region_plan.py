@@ -11,7 +11,7 @@ import numpy as np
 from splatbot.collision import RobotSpheres
 from splatbot.errors import InputError
 from splatbot.planning import GaussianRRTStar, JointTrajectory, Path, PlanResult, time_path
-from splatbot.protocols import Array
+from splatbot.protocols import Array, HasHand
 from splatbot.results.margin import CONSTANTS as MARGIN
 from splatbot.results.margin import AuditedError
 
@@ -64,12 +64,13 @@ class RegionPlan:
             unknown: how unknown space counts: "free", "cautious" or "occupied".
             confidence: share of the measured surface that an audited margin covers.
         """
-        audited, margin = self.points is not None, self.planner.margin
+        audited, margin, robot = self.points is not None, self.planner.margin, self.planner.arm.robot
         return {
             "map_gaussians": len(self.planner.field),
             "n_sigma": n_sigma,
             "self_collision": True,
             "base": False,
+            "hand": isinstance(robot, HasHand) and robot.hand is not None,
             "base_in_map": self.planner.arm.base_in_map_above(self.planner.field, CONSTANTS.base_foot),
             "unknown_space": unknown,
             "margin_m": margin,

@@ -41,7 +41,7 @@ def test_a_certified_trajectory_is_written_with_its_pictures(run: RunCommand, ma
     assert summary["robot"] == "panda"
     assert summary["joint_names"] == [f"panda_joint{k}" for k in range(1, 8)]
     assert summary["T_world_base"] == {"translation": [0, 0, 0], "quaternion_wxyz": [1, 0, 0, 0]}
-    assert not summary["covers"]["base_in_map"]
+    assert (summary["covers"]["base_in_map"], summary["covers"]["hand"]) == (False, True)
     message = json.loads((out / "trajectory.json").read_text())
     np.testing.assert_allclose(message["points"][0]["positions"], panda().home, atol=1e-9)
     np.testing.assert_allclose(message["points"][-1]["positions"], GOAL, atol=1e-9)
@@ -85,8 +85,10 @@ def test_unknown_space_at_the_start_is_named_instead_of_a_gaussian() -> None:
     field = GaussianCollisionField(GaussianModel.concatenate([model, unknown]))
     result = GaussianRRTStar(field, panda()).plan(panda().home, panda().home, budget_ms=10)
     with pytest.raises(SplatbotError, match="no frame saw to be empty"):
-        _refuse_unknown(result, len(model))
-    _refuse_unknown(result, len(model) + 2)  # a Gaussian of the map is named by the planner
+        _refuse_unknown(result, len(model), "occupied")
+    with pytest.raises(SplatbotError, match="two frames looked and measured no depth"):
+        _refuse_unknown(result, len(model), "cautious")
+    _refuse_unknown(result, len(model) + 2, "occupied")  # a Gaussian of the map is named by the planner
 
 
 def test_the_base_is_taken_from_the_scene_file_of_the_map_and_a_pose_is_reached(
