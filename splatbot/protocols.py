@@ -86,6 +86,11 @@ class RobotKinematics(Protocol):
         ...
 
     @property
+    def home(self) -> Array:
+        """Posture (J,) [rad or m] in which the arm waits."""
+        ...
+
+    @property
     def self_collision_pairs(self) -> NDArray[np.int32]:
         """(M, 2) links that may not touch each other."""
         ...

@@ -300,7 +300,7 @@ class _RobotVariant:
     """A robot with replaced spheres or replaced pairs of links that may not touch."""
 
     def __init__(self, arm: RobotSpheres, spheres: LinkSpheres, pairs: NDArray[np.int32]) -> None:
-        self.name, self.chain = arm.robot.name, arm.robot.chain
+        self.name, self.chain, self.home = arm.robot.name, arm.robot.chain, arm.robot.home
         self.self_collision_pairs = pairs
         self._spheres = spheres
 

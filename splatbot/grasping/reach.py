@@ -106,9 +106,7 @@ class ArmReach:
         if not 0.0 <= margin < np.inf:
             raise InputError(f"is {margin}.", field="margin", hint="give metres, 0 or more")
         self.robot, self.around, self.whole, self.seed = robot, around, whole, seed
-        chain = robot.chain
         stroke = hand_of(robot).stroke
-        self._near = (chain.lower + chain.upper) / 2
 
         @cache
         def arm(steps: int) -> RobotSpheres:
@@ -128,7 +126,7 @@ class ArmReach:
             arm,
             self.around,
             PoseGoal(T_world_tcp, postures=CONSTANTS.max_solutions),
-            near=self._near,
+            near=self.robot.home,
             seed=self.seed,
             until=time.perf_counter(),
         )

@@ -13,7 +13,7 @@ from splatbot.errors import InputError
 from splatbot.geometry import so3_exp
 from splatbot.planning.causes import collision, limit_violation
 from splatbot.planning.ik import CONSTANTS as IK
-from splatbot.planning.ik import HasTool, inverse_kinematics, is_rigid
+from splatbot.planning.ik import HasTool, inverse_kinematics, is_rigid, nearest_turns
 from splatbot.planning.problem import Cause, Goal, GoalError, JointGoal, PlanStatus, PoseGoal
 from splatbot.protocols import Array, KinematicChain
 
@@ -84,7 +84,7 @@ def goal_configurations(
         arm: the robot.
         field: the map.
         goal: see :mod:`splatbot.planning.problem`.
-        near: (J,) first start of the inverse kinematics [rad or m].
+        near: (J,) first start of the inverse kinematics, whose full turns the postures of a pose share [rad or m].
         seed: seed of the random starts.
         until: time of ``time.perf_counter`` at which the search for further postures ends [s].
 
@@ -142,6 +142,7 @@ def _postures(
         if tried == 0:
             starts[0], offsets[0] = near, 0.0
         q, error = _solve(arm, robot.T_link_tcp, T, offsets, starts)
+        q = nearest_turns(q, near, chain)
         converged = (error <= IK.max_error).all(axis=1)
         if converged.any():
             free = ~arm.check(field, q).in_collision

@@ -121,6 +121,23 @@ def inverse_kinematics(
     return q, error
 
 
+def nearest_turns(q: Array, near: Array, chain: KinematicChain) -> Array:
+    """Turn revolute joints by full turns to the values nearest to ``near`` that are within the limits.
+
+    The links stay where they are, but an arm whose joints turn further than once (most UR arms) moves less to them.
+
+    Args:
+        q: (..., J) configurations [rad or m] within the limits.
+        near: (J,) posture [rad or m].
+        chain: joints with their limits.
+    """
+    turn = 2 * np.pi
+    wanted = np.round((near - q) / turn)
+    turns = np.clip(wanted, np.ceil((chain.lower - q) / turn), np.floor((chain.upper - q) / turn))
+    moved = np.clip(q + turn * turns, chain.lower, chain.upper)  # the sum may round to beyond a limit
+    return np.asarray(np.where(chain.prismatic | (turns == 0.0), q, moved))
+
+
 def is_rigid(T: Array) -> bool:
     """Return whether ``T`` is a finite (4, 4) pose with an orthonormal rotation."""
     return bool(
@@ -142,7 +159,8 @@ def solve_ik(
 
     The starts are ``near``, the home posture and uniformly random configurations. While none of them gives a
     free solution, further random starts follow, up to 512 in total. With ``seeds=1`` only ``near`` is solved, so that a
-    sequence of calls follows one branch of solutions. Equal arguments give equal solutions.
+    sequence of calls follows one branch of solutions. Equal arguments give equal solutions. Joints that can turn further
+    than once take the turn nearest to ``near``.
 
     Args:
         robot: the arm.
@@ -164,11 +182,12 @@ def solve_ik(
     fixed = posture[None] if near is None else np.stack([posture, robot.home])
     rng = np.random.default_rng(seed)
     starts = np.concatenate([fixed, _random(chain, max(0, seeds - len(fixed)), rng)])[:seeds]
-    q, tried = _solutions(robot, T, starts), len(starts)
+    q, tried = nearest_turns(_solutions(robot, T, starts), posture, chain), len(starts)
     kept = _distinct(q, posture, apart, free)
     while seeds > 1 and not len(kept) and tried < CONSTANTS.max_starts:
         starts = _random(chain, min(seeds, CONSTANTS.max_starts - tried), rng)
-        q, tried = np.concatenate([q, _solutions(robot, T, starts)]), tried + len(starts)
+        more = nearest_turns(_solutions(robot, T, starts), posture, chain)
+        q, tried = np.concatenate([q, more]), tried + len(starts)
         kept = _distinct(q, posture, apart, free)
     return IkSolutions(kept, tried, len(q))
 

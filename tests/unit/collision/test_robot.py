@@ -263,6 +263,7 @@ class _Stick:
         self.chain = KinematicChain(("turn",), T[None], np.array([False]), -3 * one, 3 * one, one, one, one, one)
         self._spheres = LinkSpheres(np.ones(1, np.int32), np.array([[0.45, 0.0, 0.0]]), np.array([0.005]))
         self.self_collision_pairs = np.zeros((0, 2), np.int32)
+        self.home = np.zeros(1)
 
     def spheres(self, opening: float | None = None) -> LinkSpheres:
         return self._spheres

@@ -10,6 +10,7 @@ from splatbot.collision import GaussianCollisionField
 from splatbot.geometry import pose_from_quat, so3_log
 from splatbot.planning import GaussianRRTStar, GoalError, JointGoal, PlanStatus, PoseGoal
 from splatbot.robots.panda import panda
+from splatbot.robots.store import load_robot
 from tests.unit.planning.test_rrt_star import LEFT, RIGHT
 from tests.unit.planning.toys import Slider, ball_world, cause_of
 
@@ -45,6 +46,18 @@ def test_the_base_may_stand_anywhere() -> None:
     T = T_world_base @ panda().tcp(RIGHT)
     path = planner.plan(LEFT, PoseGoal(T), budget_ms=300).unwrap()
     np.testing.assert_allclose(T_world_base @ panda().tcp(path.waypoints[-1]), T, atol=2e-6)
+
+
+def test_a_pose_behind_a_full_turn_is_reached_the_short_way() -> None:
+    robot = load_robot("ur5e")
+    far = ball_world()
+    far.means += 50.0
+    planner = GaussianRRTStar(GaussianCollisionField(far), robot)
+    goal = robot.home + 0.2
+    for seed in range(5):
+        path = planner.plan(robot.home, PoseGoal(robot.tcp(goal)), budget_ms=50, seed=seed).unwrap()
+        assert (np.abs(path.waypoints[-1] - robot.home) <= np.pi + 1e-9).all()
+        assert path.cost < 1.0
 
 
 def test_a_pose_out_of_reach_has_no_solution_and_says_by_how_much(planner: GaussianRRTStar) -> None:

@@ -39,6 +39,7 @@ class Slider:
             ones,
             ones,
         )
+        self.home = 0.0 * ones
         self._radius = radius
 
     @property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,10 +13,11 @@ from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.errors import InputError
 from splatbot.geometry import so3_log
 from splatbot.planning.ik import CONSTANTS as IK
-from splatbot.planning.ik import solve_ik
+from splatbot.planning.ik import nearest_turns, solve_ik
 from splatbot.protocols import Array
 from splatbot.robots.panda import panda
 from splatbot.robots.robot import RobotModel
+from splatbot.robots.store import load_robot
 
 toolbox: Any = pytest.importorskip("roboticstoolbox")
 
@@ -105,6 +107,35 @@ def test_one_seed_follows_the_branch_of_the_posture() -> None:
     q = solve_ik(robot, robot.tcp(robot.home), near=near, seeds=1).q
     assert len(q) == 1
     assert np.abs(q[0] - near).max() < 0.15
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_joints_that_turn_twice_take_the_turn_nearest_to_the_posture(seed: int) -> None:
+    robot = load_robot("ur5e")
+    chain = robot.chain
+    assert (chain.upper - chain.lower > 2 * np.pi).any()
+    for q in robot.random(5, np.random.default_rng(seed)):
+        answer = solve_ik(robot, robot.tcp(q), seeds=16)
+        assert len(answer.q)
+        for solution in answer.q:
+            assert max(pose_error(robot.tcp(solution), robot.tcp(q))) < 2e-6
+            for turns in (-1, 1):
+                other = solution + 2 * np.pi * turns
+                nearer = np.abs(other - robot.home) < np.abs(solution - robot.home) - 1e-9
+                assert not (nearer & (other >= chain.lower) & (other <= chain.upper)).any()
+        assert robot.within_limits(answer.q).all()
+
+
+def test_a_full_turn_stays_within_limits_and_leaves_slides_alone() -> None:
+    robot = load_robot("ur5e")
+    lower, prismatic = robot.chain.lower.copy(), robot.chain.prismatic.copy()
+    lower[0], prismatic[1] = -1.0, True
+    chain = replace(robot.chain, lower=lower, prismatic=prismatic)
+    q, near = np.array([6.0, 6.0, 3.0, -6.0, 3.0, 0.0]), np.full(6, -3.0)
+    turned = nearest_turns(q, near, chain)
+    np.testing.assert_allclose(turned, [6.0 - 2 * np.pi, 6.0, 3.0, -6.0, 3.0 - 2 * np.pi, 0.0])
+    lower[0] = -0.2  # now a full turn back would leave the limits
+    assert nearest_turns(q, near, replace(chain, lower=lower))[0] == 6.0
 
 
 def test_configurations_that_collide_are_left_out() -> None:
