@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from splatbot.collision import GaussianCollisionField
 from splatbot.errors import InputError, SplatbotError
 from splatbot.planning import GaussianRRTStar, JointGoal, PlanResult, PoseGoal
 from splatbot.results.margin import AuditedError, audited_error
@@ -36,8 +37,13 @@ class MarginSource:
     why: str
 
 
-def margin_source(served: ServedMap, given: Margin) -> MarginSource:
-    """Return the source of a margin. The audit of a map version takes seconds, once.
+def margin_source(served: ServedMap, given: Margin, field: GaussianCollisionField | None = None) -> MarginSource:
+    """Return the source of a margin. The audit of a map version takes seconds, once for each kind of field.
+
+    Args:
+        served: the map.
+        given: the margin of the request.
+        field: collision field of the map that is audited; by default that of plans.
 
     Raises:
         SplatbotError: the margin is "auto" and the map has no recording, or one that cannot be read.
@@ -47,12 +53,13 @@ def margin_source(served: ServedMap, given: Margin) -> MarginSource:
     if given is None and served.run is None:
         return MarginSource(None, 0.0, "unknown: the map has no recording; 0 is assumed")
     try:
-        error = served.derived.get("audited error", lambda: _audit(served))
+        field = served.field if field is None else field
+        error = served.derived.get(("audited error", field.n_sigma, field.gate), lambda: _audit(served, field))
     except SplatbotError as failure:
         if given == "auto":
             raise
         return MarginSource(None, 0.0, f"unknown: the recording cannot be audited ({failure.message}); 0 is assumed")
-    return MarginSource(error, 0.0, "audited error of the map in the region of the motion")
+    return MarginSource(error, 0.0, "audited error of the map where the arm moves")
 
 
 def plan_with_margin(
@@ -79,7 +86,7 @@ def plan_with_margin(
     return plan_at_margin(make_planner(source.margin), plan, speed=speed, acceleration=acceleration)
 
 
-def _audit(served: ServedMap) -> AuditedError:
+def _audit(served: ServedMap, field: GaussianCollisionField) -> AuditedError:
     """Compare the map with the raw depth of its recording.
 
     Raises:
@@ -88,4 +95,4 @@ def _audit(served: ServedMap) -> AuditedError:
     if served.run is None:
         hint = "give the margin in metres, or map a recording"
         raise InputError(f"is not known for map {served.id!r}, which has no recording.", field="margin", hint=hint)
-    return audited_error(served.run.path, reopen_log(served.run), served.field)
+    return audited_error(served.run.path, reopen_log(served.run), field)

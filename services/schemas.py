@@ -233,13 +233,19 @@ class GraspsRequest(Request):
     min_confidence: Annotated[float, Field(ge=0, le=1)] = Field(
         0.5, description="least probability of success of a grasp, as simulated trials calibrate it"
     )
-    accept_implied: bool = Field(False, description="offer grasps of which no contact is at measured depth")
+    accept_implied: bool = Field(
+        False, description="offer grasps of which no contact is at measured depth, or whose finger enters unseen space"
+    )
     friction: Annotated[float, Field(gt=0, le=2)] = Field(0.5, description="coefficient between pads and object")
     samples: Annotated[int, Field(ge=10, le=5000)] = Field(
         400, description="places tried, four times as many with sharper rims where that finds nothing: the knob of time"
     )
     wanted: Annotated[int, Field(ge=1, le=100)] = Field(10, description="largest number of grasps")
-    margin: Annotated[float, Field(ge=0, le=1)] = Field(0.0, description="room to keep from the rest [m]")
+    margin: Annotated[float, Field(ge=0, le=MOST_MARGIN_M, strict=True)] | Literal["auto"] | None = Field(
+        None,
+        description='clearance of hand and arm to the rest [m], or "auto": the audited error of the map around the '
+        'target, for the arm alone. The default is "auto" where the map has a recording, else 0',
+    )
     min_observations: Annotated[int, Field(ge=1, le=1000)] = Field(
         1, description="least number of keyframes of a Gaussian"
     )

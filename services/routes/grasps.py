@@ -14,9 +14,11 @@ from splatbot.grasping.language import LanguageAffordance
 from splatbot.grasping.options import GraspOptions
 from splatbot.grasping.spatial import SpatialAffordance
 from splatbot.grasping.summary import summary
+from splatbot.results.margin import CONSTANTS as MARGIN
 from splatbot.services.arms import known_robot
 from splatbot.services.codecs import answer, answers, body_of, request_body
 from splatbot.services.dependencies import ServedAfterFrames, Service, problems
+from splatbot.services.margins import margin_source
 from splatbot.services.robots_in_maps import base_in, objects_in
 from splatbot.services.schemas import GraspsRequest
 from splatbot.services.topics import GRASPS
@@ -38,6 +40,9 @@ _ANSWER = {
     "candidates": 2100,
     "notes": [],
     "seconds": {"contacts": 0.05},
+    "margin_m": 0.0,
+    "arm_margin_m": 0.006,
+    "margin_source": "audited error of the map where the arm moves",
 }
 _Body = Annotated[GraspsRequest, Depends(body_of(GraspsRequest))]
 
@@ -56,9 +61,12 @@ def grasps(request: Request, served: ServedAfterFrames, service: Service, query:
     robot, base = known_robot(query.robot), base_in(served, query.base)
     objects = objects_in(served, base, as_known=query.base is None)
     found = find_target(_hint(query), objects.scene, [LanguageAffordance(), SpatialAffordance()])
-    sampler = objects.sampler(
-        robot, hand_only=query.hand_only, margin=query.margin, min_observations=query.min_observations
-    )
+    sampler = objects.sampler(robot, hand_only=query.hand_only, min_observations=query.min_observations)
+    source = margin_source(served, query.margin, sampler.field)
+    sampler.margin = source.margin
+    if source.error is not None:
+        means = objects.scene.model.means.detach().double().numpy()
+        sampler.arm_margin = source.error.in_region(means[found.rows]).quantile(MARGIN.confidence)
     options = GraspOptions(
         friction=query.friction,
         samples=query.samples,
@@ -71,7 +79,12 @@ def grasps(request: Request, served: ServedAfterFrames, service: Service, query:
     result = objects.with_notes(sampler.sample(found, options))
     result.unwrap()
     service.store.tell(served, GRASPS, result)
-    return answer(request, summary(result) | {"map_version": served.map_version})
+    said = {
+        "margin_m": sampler.margin,
+        "arm_margin_m": max(sampler.margin, sampler.arm_margin),
+        "margin_source": source.why,
+    }
+    return answer(request, summary(result) | said | {"map_version": served.map_version})
 
 
 def _hint(query: GraspsRequest) -> Hint:

@@ -29,7 +29,9 @@ _ANSWER = {
             "center_world_m": [0.1, 0.2, 0.8],
             "center_base_m": [0.5, 0.0, 0.04],
             "gaussians": 540,
+            "on_support": True,
             "graspable_by_size": True,
+            "verdict": "fits",
             "obstacle": None,
         }
     ],

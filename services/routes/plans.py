@@ -39,7 +39,7 @@ _ANSWER = {
     "certified": True,
     "clearance_m": 0.05,
     "margin_m": 0.006,
-    "margin_source": "audited error of the map in the region of the motion",
+    "margin_source": "audited error of the map where the arm moves",
     "covers": {"n_sigma": 2.0, "self_collision": True, "base": False, "unknown_space": "free", "region_points": 5831},
     "waypoints": [[0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785], [0.3, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785]],
     "trajectory": {"joint_names": ["panda_joint1"], "points": []},

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from splatbot.cli.paths import check_file, check_output
-from splatbot.cli.placing import Pose, base_pose, margin_of
+from splatbot.cli.placing import Pose, base_pose, margin_value, run_folder
 from splatbot.errors import InputError, SplatbotError
 from splatbot.layouts import map_file
 
@@ -17,7 +17,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from splatbot.grasping.affordance import Hint, ObservedView
+    from splatbot.grasping.affordance import Hint, ObservedView, Target
+    from splatbot.grasping.sampler import GraspSampler
     from splatbot.grasping.types import GraspResult
     from splatbot.robots.graspable_objects import GraspableObjects
 
@@ -43,7 +44,7 @@ def grasp(
     samples: int = 400,
     wanted: int = 10,
     pregrasp: float = 0.10,
-    margin: Annotated[str, tyro.conf.arg(metavar="M|auto")] = "0",
+    margin: Annotated[str | None, tyro.conf.arg(metavar="M|auto")] = None,
     n_sigma: float = 1.0,
     min_observations: int = 1,
     seed: int = 0,
@@ -79,12 +80,15 @@ def grasp(
         hand_only: ignore the arm and its reachability.
         approach: direction of the approach.
         min_confidence: least probability of success 0..1 of a grasp, as simulated trials calibrate it.
-        accept_implied: offer grasps of which no contact is at measured depth; such sides follow from the visible ones.
+        accept_implied: offer grasps of which no contact is at measured depth, or whose finger enters unseen space; such
+            sides follow from the visible ones.
         friction: friction coefficient between finger pads and object.
         samples: sampled surface points, which determine the time. Without a result, four times as many are tried.
         wanted: largest number of grasps.
         pregrasp: length of the straight approach [m].
-        margin: clearance [m] of hand and arm to the rest of the map; "auto" as in `splatbot plan`.
+        margin: clearance [m] of hand and arm to the rest of the map. "auto", the default with a run, is the audited
+            error of the map around the target, for the arm alone: the hand has to come close, and is checked against
+            raw depth.
         n_sigma: surface of a Gaussian, in standard deviations; smaller than for planning, because the hand comes close.
         min_observations: least number of keyframes that support a Gaussian; others are ignored.
         seed: seed of the search.
@@ -130,7 +134,11 @@ def grasp(
     hint = _hint(map, index, target=target, pixel=pixel, point=point, box=box, mask=mask, tag=tag)
     found = find_target(hint, scene, [*name_backends(vlm=vlm), SpatialAffordance(), TagAffordance()])
     sampler = objects.sampler(arm, hand_only=hand_only, n_sigma=n_sigma, min_observations=min_observations)
-    sampler.margin = margin_of(margin, map, sampler.field, scene.T_world_base)
+    auto = margin == "auto" or (margin is None and sampler.raw is not None)
+    if auto:
+        sampler.arm_margin = _audited(map, sampler, found)
+    else:
+        sampler.margin = margin_value(margin or "0")
     result = objects.with_notes(sampler.sample(found, options))
     folder = out if out is not None else Path("runs") / "grasp"
     folder.mkdir(parents=True, exist_ok=True)
@@ -146,7 +154,7 @@ def grasp(
         why = " ".join(note for note in found.notes if note.startswith("took "))
         raise SplatbotError(f"cannot be grasped: {reason}. {why}".strip(), field=found.label, hint=change)
     result.unwrap()
-    _print(result, folder, margin=sampler.margin, raw=sampler.raw is not None, verbose=verbose)
+    _print(result, folder, _margin_text(sampler, auto=auto), verbose=verbose)
     return 0
 
 
@@ -226,10 +234,26 @@ def _view(map_: Path, index: int) -> ObservedView:
     return ObservedView(replace(log.camera, distortion=()), poses[index], log[index].rgb)
 
 
-_HAND = {True: "the hand clears measured depth too", False: "nor for the hand, because there is no run with depth"}
+def _audited(map_: Path, sampler: GraspSampler, target: Target) -> float:
+    """Return the audited error of the map around a target [m]."""
+    from splatbot.results.margin import CONSTANTS, audited_error
+    from splatbot.robots.in_view import reopen_log
+
+    error = audited_error(map_, reopen_log(run_folder(map_, "--margin auto")), sampler.field)
+    means = sampler.scene.model.means.detach().double().numpy()
+    return error.in_region(means[target.rows]).quantile(CONSTANTS.confidence)
 
 
-def _print(result: GraspResult, folder: Path, *, margin: float, raw: bool, verbose: bool) -> None:
+def _margin_text(sampler: GraspSampler, *, auto: bool) -> str:
+    hand = "the hand clears measured depth" if sampler.raw is not None else "no run with depth checks the hand"
+    if auto:
+        return f"arm {1e3 * sampler.arm_margin:.1f} mm, the error of the map around the target; {hand}"
+    if sampler.margin > 0.0:
+        return f"{1e3 * sampler.margin:.1f} mm for arm and hand; {hand}"
+    return f"0, so that errors of the map are not covered; {hand}"
+
+
+def _print(result: GraspResult, folder: Path, margin: str, *, verbose: bool) -> None:
     from rich.table import Table
 
     from splatbot.cli.tables import print_columns, print_table, print_text
@@ -240,10 +264,7 @@ def _print(result: GraspResult, folder: Path, *, margin: float, raw: bool, verbo
         ("target", f"{target.label}, {len(target.rows)} Gaussians, by {target.backend} ({target.score:.2f})"),
         ("candidates", f"{result.candidates} hands in {1e3 * seconds:.0f} ms"),
         *(("note", note) for note in (*target.notes, *result.notes)),
-        (
-            "margin",
-            f"{1e3 * margin:.1f} mm" if margin else "0: the map's errors are not covered for the arm; " + _HAND[raw],
-        ),
+        ("margin", margin),
         ("written to", f"{folder}: grasp.json has poses, joint values and terms; grasp.png shows the first"),
     ]
     print_table(rows, title="grasps")

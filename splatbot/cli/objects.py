@@ -10,7 +10,7 @@ import tyro
 
 from splatbot.cli.paths import check_output
 from splatbot.cli.placing import Pose
-from splatbot.cli.tables import print_columns, print_table
+from splatbot.cli.tables import print_columns, print_table, print_text
 from splatbot.layouts import map_file
 
 if TYPE_CHECKING:
@@ -28,7 +28,8 @@ def objects(
 ) -> int:
     """List the supports and objects of a map with labels and sizes, so that a target can be named.
 
-    Writes a picture with the number of each object. `splatbot grasp --target "object 3"` takes an object of the list.
+    Objects that stand on a support come first; the other clusters are often parts of the background. Writes a picture
+    with the number of each object. `splatbot grasp --target "object 3"` takes an object of the list.
 
     Examples:
         splatbot objects runs/desk
@@ -75,9 +76,23 @@ def _print(found: tuple[ListedObject, ...], planes: list[dict[str, Any]]) -> Non
         size = " x ".join(f"{x:.2f}" for x in plane["size_m"])
         rows.append((plane["label"], f"{size} m, {plane['height_base_m']:+.3f} m above the base"))
     print_table(rows, title="planes")
-    table = Table("target", "label", "size, mm", "at, m from the base", "hand")
-    for item in found:
-        size = " x ".join(f"{1e3 * x:.0f}" for x in item.size)
-        at = " ".join(f"{x:.2f}" for x in item.at_base)
-        table.add_row(f"object {item.number}", item.label, size, at, item.obstacle or "fits")
-    print_columns(table)
+    for title, on_support in (("objects", True), ("clusters that stand on no support", False)):
+        chosen = [item for item in found if item.on_support == on_support]
+        if not chosen:
+            continue
+        table = Table("object", "label", "size, mm", "at, m from the base", "hand", title=title, title_justify="left")
+        for item in chosen:
+            size = " x ".join(f"{1e3 * x:.0f}" for x in item.size)
+            at = " ".join(f"{x:.2f}" for x in item.at_base)
+            table.add_row(str(item.number), item.label, size, at, item.verdict)
+        print_columns(table)
+    for verdict in dict.fromkeys(item.verdict for item in found if item.obstacle):
+        print_text(f"{verdict}: {_MEANINGS[verdict]}")
+
+
+_MEANINGS = {
+    "no hand": "the robot has no hand; --robot takes one that has",
+    "too flat": "lower than 12 mm, so that no hand encloses it",
+    "too wide": "its faces are farther apart than the hand opens, less 2 mm at each pad",
+    "too far": "beyond the reach of the arm from this base; --json has the distances",
+}

@@ -9,7 +9,6 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from splatbot.collision import GaussianCollisionField
     from splatbot.results.folder import RunFolder
 
 Pose = tuple[float, float, float, float, float, float, float]
@@ -48,21 +47,6 @@ def base_pose(pose: Pose | None, map_: Path) -> NDArray[np.float64]:
         hint = "give --base, or write a scene.yaml: splatbot info MAP --fit-plane estimates one"
         raise InputError("is not known.", file=map_, field="base", hint=hint)
     return known.T_world_base
-
-
-def margin_of(text: str, map_: Path, field: GaussianCollisionField, T_world_base: NDArray[np.float64]) -> float:
-    """Parse a margin [m]; "auto" is the surface error of the run.
-
-    Raises:
-        InputError: it is neither, or the map is no run folder.
-    """
-    if text == "auto":
-        from splatbot.results.margin import own_margin
-        from splatbot.robots.in_view import reopen_log
-
-        run = run_folder(map_, "--margin auto")
-        return own_margin(map_, reopen_log(run), field, T_world_base)
-    return margin_value(text)
 
 
 def run_folder(map_: Path, flag: str) -> RunFolder:

@@ -227,6 +227,17 @@ class RobotSpheres:
             margin=self.margin,
         )
 
+    def without_hand(self, margin: float) -> RobotSpheres:
+        """Return the links before the hand alone, with another margin [m] to the map and no self-collision checks."""
+        keep = self.spheres.link < len(self.robot.chain)
+        links = LinkSpheres(self.spheres.link[keep], self.spheres.centers[keep], self.spheres.radii[keep])
+        return RobotSpheres(
+            _RobotVariant(self, links, np.zeros((0, 2), np.int32)),
+            T_world_base=self.T_world_base,
+            base_in_map=self.base_in_map,
+            margin=margin,
+        )
+
     @cached_property
     def reach(self) -> Array:
         """Largest motions (K, J) of spheres per unit of each joint [m per rad or m].

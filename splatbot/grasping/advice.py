@@ -63,8 +63,8 @@ def first_change(result: GraspResult, scene: SegmentedMap, stroke: float) -> tup
     number = result.target.number
     if 0 <= number < len(scene.objects):
         size = obstacle(scene.objects[number], stroke)
-        if size:
-            return size, "take a hand that opens wider (`splatbot robot list`), or another target"
+        if size is not None:
+            return size.reason, "take a hand that opens wider (`splatbot robot list`), or another target"
     ranked = sorted(result.rejected.items(), key=lambda pair: -pair[1])
     for reason, count in ranked:
         for words, why, change in _CHANGES:

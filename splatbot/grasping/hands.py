@@ -35,6 +35,9 @@ class HandPoseConstants:
     wider."""
     pad_gap: float = 0.003
     """Distance [m] between each pad and the target during the approach. A larger one needs a wider opening."""
+    min_pad_gap: float = 0.002
+    """Smallest such distance [m], at the widest opening. It covers errors of the map and the arm; a smaller one offers
+    objects that the hand may not clear."""
     opening_step: float = 0.002
     """Step [m] to whose multiples finger openings are rounded up. A larger one opens the hand wider than the target
     needs."""
@@ -43,6 +46,11 @@ class HandPoseConstants:
 
 
 CONSTANTS = HandPoseConstants()
+
+
+def usable_opening(stroke: float) -> float:
+    """Return the largest width [m] that a hand of this ``stroke`` [m] encloses with a gap at each pad."""
+    return max(stroke - 2 * CONSTANTS.min_pad_gap, 0.0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from splatbot.collision.confirmed import confirmed_near
-from splatbot.collision.visibility import DepthView
+from splatbot.collision.visibility import DepthView, measured_depths
 from splatbot.grasping.hands import Hands
 from splatbot.protocols import Array, HandShape
 
@@ -24,6 +24,10 @@ class MeasuredDepthConstants:
         pad_penetration: [m] depth of a confirmed point in a closing finger at which it stops. It is smaller, because
             the frames that the search does not read confirm further points.
         contact_distance: [m] largest distance of a measured contact from the nearest confirmed point.
+        unseen_from: [m] distance of a contact from depth above which its finger must be in space that was seen.
+        max_unseen: largest unseen share of the inner face of such a finger.
+        seen_sigmas: standard deviations of depth by which a ray must end behind a point to show that it is free.
+        face_grid: points of a finger's inner face across and along its approach.
         spacing: [m] edge of the voxels in which each frame proposes one point.
         fine_spacing: [m] the same for the last check of one grasp.
         frames: largest number of raw depth images of a recording (150 MB).
@@ -34,6 +38,10 @@ class MeasuredDepthConstants:
     max_penetration: float = 0.003
     pad_penetration: float = 0.002
     contact_distance: float = 0.003
+    unseen_from: float = 0.006
+    max_unseen: float = 0.1
+    seen_sigmas: float = 3.0
+    face_grid: tuple[int, int] = (7, 15)
     spacing: float = 0.003
     fine_spacing: float = 0.001
     frames: int = 120
@@ -42,6 +50,9 @@ class MeasuredDepthConstants:
 
 
 CONSTANTS = MeasuredDepthConstants()
+
+
+_TIP = 0.002  # [m] of a finger's end, which may be as near to a support as depth is noisy
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +121,34 @@ class RawDepth:
             inside=inside,
         )
 
+    def unseen(self, hands: Hands, hand: HandShape) -> Array:
+        """Return the share (K, 2) of the inner face of each finger, at -y and at +y, that no frame saw to be free.
+
+        A frame shows that a point is free if its depth there is more than 3σ behind the point. In simulated scans from
+        one side, the true object was in none of the offered fingers of which at most 0.1 was unseen, but in 45 % of
+        those with more than 0.7 unseen, by more than 3 mm.
+
+        Args:
+            hands: K hands; the fingers are apart by their openings.
+            hand: shape of the hand.
+        """
+        across, ahead = CONSTANTS.face_grid
+        x, z = np.meshgrid(
+            np.linspace(-hand.width / 2, hand.width / 2, across),
+            np.linspace(-hand.palm, hand.tip - _TIP, ahead),
+            indexing="ij",
+        )
+        y = hands.opening[:, None, None] / 2 * np.array([[-1.0], [1.0]]) * np.ones(x.size)
+        local = np.stack([np.broadcast_to(x.ravel(), y.shape), y, np.broadcast_to(z.ravel(), y.shape)], axis=-1)
+        points = np.einsum("kij,kspj->kspi", hands.T[:, :3, :3], local) + hands.T[:, None, None, :3, 3]
+        flat, seen = points.reshape(-1, 3), np.zeros(points[..., 0].size, np.bool_)
+        for depth, camera, T_world_camera in self.views:
+            left = np.flatnonzero(~seen)
+            rows, measured, own = measured_depths(flat[left], depth, camera, T_world_camera)
+            free = measured - own > CONSTANTS.seen_sigmas * (self.floor + self.quad * own**2)
+            seen[left[rows[free]]] = True
+        return np.asarray(1.0 - seen.reshape(len(hands), 2, x.size).mean(axis=2))
+
 
 def hand_penetration(hands: Hands, points: Array, hand: HandShape, *, retreat: float) -> Array:
     """Return the depth (K,) [m] of the deepest point in fingers or palm on an approach of ``retreat`` [m].
@@ -169,3 +208,8 @@ def contact_distances(contacts: Array, points: Array) -> Array:
     if not len(points):
         return np.full(contacts.shape[:-1], np.inf)
     return np.asarray(cKDTree(points).query(contacts)[0])
+
+
+def blind(depth_distance: Array, unseen: Array) -> NDArray[np.bool_]:
+    """Return which fingers (..., ) enter unseen space, by the distance of their contacts from depth [m]."""
+    return (depth_distance > CONSTANTS.unseen_from) & (unseen > CONSTANTS.max_unseen)

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 
 from splatbot.geometry import inverse, transform_points
+from splatbot.grasping.hands import CONSTANTS as HANDS
+from splatbot.grasping.hands import usable_opening
 from splatbot.grasping.language import color_name, shape_name
 from splatbot.protocols import Array, HasHand, RobotKinematics
 from splatbot.segmentation import MapObject, SegmentedMap
@@ -21,12 +23,28 @@ class ObjectListConstants:
 
     Args:
         min_height: [m] height below which an object is a flat patch, which a hand cannot enclose.
+        max_gap: [m] largest height of an object's lowest points above the support that it stands on. Undersides are
+            seldom seen.
     """
 
     min_height: float = 0.012
+    max_gap: float = 0.03
 
 
 CONSTANTS = ObjectListConstants()
+
+
+@dataclass(frozen=True)
+class Obstacle:
+    """Reason why a hand cannot enclose an object, or an arm cannot reach it.
+
+    Args:
+        verdict: two words.
+        reason: clause with the measured values.
+    """
+
+    verdict: str
+    reason: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +58,8 @@ class ListedObject:
         at_world, at_base: (3,) centre of the bounding box [m].
         gaussians: number of Gaussians.
         fits: whether the hand can enclose it.
+        on_support: whether it stands on a support of the map, and does not float or hang.
+        verdict: "fits", or the obstacle in two words: "no hand", "too flat", "too wide" or "too far".
         obstacle: reason why the hand cannot enclose it or the arm cannot reach it, or "".
     """
 
@@ -50,6 +70,8 @@ class ListedObject:
     at_base: Array = field(repr=False)
     gaussians: int = 0
     fits: bool = True
+    on_support: bool = True
+    verdict: str = "fits"
     obstacle: str = ""
 
     def to_dict(self) -> dict[str, Any]:
@@ -62,7 +84,9 @@ class ListedObject:
             "center_world_m": self.at_world.round(4).tolist(),
             "center_base_m": self.at_base.round(4).tolist(),
             "gaussians": self.gaussians,
+            "on_support": self.on_support,
             "graspable_by_size": self.fits,
+            "verdict": self.verdict,
             "obstacle": self.obstacle or None,
         }
 
@@ -77,7 +101,8 @@ def list_objects(scene: SegmentedMap, robot: RobotKinematics) -> tuple[ListedObj
     T_base_world, stroke = inverse(scene.T_world_base), stroke_of(robot)
     found = []
     for item in scene.objects:
-        at, size = transform_points(T_base_world, item.center), obstacle(item, stroke)
+        at, by_size = transform_points(T_base_world, item.center), obstacle(item, stroke)
+        limit = by_size or _too_far(at, float(np.linalg.norm(item.size)) / 2, robot)
         found.append(
             ListedObject(
                 item.number,
@@ -86,8 +111,10 @@ def list_objects(scene: SegmentedMap, robot: RobotKinematics) -> tuple[ListedObj
                 item.center,
                 at,
                 len(item.rows),
-                not size,
-                size or _too_far(at, float(np.linalg.norm(item.size)) / 2, robot),
+                fits=by_size is None,
+                on_support=_stands(scene, item),
+                verdict=limit.verdict if limit else "fits",
+                obstacle=limit.reason if limit else "",
             )
         )
     several = {label for label, count in Counter(o.label for o in found).items() if count > 1}
@@ -118,24 +145,35 @@ def stroke_of(robot: RobotKinematics) -> float:
     return hand.stroke if hand is not None else 0.0
 
 
-def _too_far(center: Array, radius: float, robot: RobotKinematics) -> str:
-    """Return the reason why an arm cannot reach a ball around a point (3,) [m, base frame], or "".
+def _stands(scene: SegmentedMap, item: MapObject) -> bool:
+    """Return whether the lowest points of an object are at most 3 cm above the highest support below them."""
+    points = scene.points[item.rows]
+    support = scene.under(points)
+    return support is not None and float(np.percentile(support.height(points), 5)) <= CONSTANTS.max_gap
+
+
+def _too_far(center: Array, radius: float, robot: RobotKinematics) -> Obstacle | None:
+    """Return why an arm cannot reach a ball around a point (3,) [m, base frame], or None.
 
     The tool is at most as far from the first joint as all links in line, which the postures of a grasp are not.
     """
     if not isinstance(robot, HasHand):
-        return ""
+        return None
     reach = robot.chain.reach(robot.T_link_tcp)
     away = float(np.linalg.norm(center - robot.chain.T_before_joint[0, :3, 3])) - radius
     if away <= reach:
-        return ""
-    return f"it is {away:.2f} m from the first joint, and the arm reaches {reach:.2f} m"
+        return None
+    return Obstacle("too far", f"it is {away:.2f} m from the first joint, and the arm reaches {reach:.2f} m")
 
 
-def obstacle(item: MapObject, stroke: float) -> str:
-    """Return the reason why a hand that opens ``stroke`` [m] cannot enclose an object, or ""."""
+def obstacle(item: MapObject, stroke: float) -> Obstacle | None:
+    """Return why a hand that opens ``stroke`` [m] cannot enclose an object with a gap at each pad, or None."""
+    if stroke <= 0.0:
+        return Obstacle("no hand", "the robot has no hand")
     if item.size[2] < CONSTANTS.min_height:
-        return f"it is flat, {1e3 * item.size[2]:.0f} mm high"
-    if item.size[1] > stroke:
-        return f"its faces are {1e3 * item.size[1]:.0f} mm apart, and the hand opens {1e3 * stroke:.0f} mm"
-    return ""
+        return Obstacle("too flat", f"it is flat, {1e3 * item.size[2]:.0f} mm high")
+    if item.size[1] > usable_opening(stroke):
+        gap = 1e3 * HANDS.min_pad_gap
+        wide = f"its faces are {1e3 * item.size[1]:.0f} mm apart, and the hand opens {1e3 * stroke:.0f} mm"
+        return Obstacle("too wide", f"{wide}, with {gap:.0f} mm of free space at each pad")
+    return None

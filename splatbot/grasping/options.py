@@ -32,7 +32,8 @@ class GraspOptions:
         wanted: maximum number of grasps to return.
         approach: "any", "top" or "side".
         min_confidence: least confidence 0..1 of a grasp that is offered.
-        accept_implied: offer grasps of which no contact is at measured depth. It has no effect without raw depth.
+        accept_implied: offer grasps of which no contact is at measured depth, or whose finger enters unseen space.
+            It has no effect without raw depth.
         seed: seed of the random generator.
 
     Raises:

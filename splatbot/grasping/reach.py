@@ -89,7 +89,8 @@ class ArmReach:
         T_world_base: (4, 4) pose of its base.
         around: field of the map without the target; the whole approach is certified against it.
         whole: field of the whole map, of which the arm must be free at the pre-grasp. If None, this is not checked.
-        margin: clearance to keep from the map [m].
+        margin: clearance that arm and hand keep from the map [m].
+        arm_margin: the same for the links before the hand alone [m].
         seed: seed of inverse kinematics.
     """
 
@@ -101,10 +102,12 @@ class ArmReach:
         whole: GaussianCollisionField | None = None,
         *,
         margin: float = 0.0,
+        arm_margin: float = 0.0,
         seed: int = 0,
     ) -> None:
-        if not 0.0 <= margin < np.inf:
-            raise InputError(f"is {margin}.", field="margin", hint="give metres, 0 or more")
+        for name, value in (("margin", margin), ("arm_margin", arm_margin)):
+            if not 0.0 <= value < np.inf:
+                raise InputError(f"is {value}.", field=name, hint="give metres, 0 or more")
         self.robot, self.around, self.whole, self.seed = robot, around, whole, seed
         stroke = hand_of(robot).stroke
 
@@ -114,6 +117,7 @@ class ArmReach:
             return RobotSpheres(robot, T_world_base=T_world_base, opening=width, margin=margin)
 
         self._arm = arm
+        self._links = arm(0).without_hand(arm_margin) if arm_margin > margin else None
 
     def arm(self, opening: float) -> RobotSpheres:
         """Return the arm's spheres with the fingers opened to ``opening`` [m], rounded up to 2 mm."""
@@ -142,6 +146,11 @@ class ArmReach:
             start = back.path.waypoints[-1]
             if self.whole is not None and arm.check(self.whole, start[None]).in_collision[0]:
                 reason, kind = "the arm touches the target before it approaches", "have a blocked approach"
+                continue
+            way = back.path.waypoints
+            if self._links is not None and self._links.certify(self.around, way[:-1], way[1:]).in_collision.any():
+                reason = f"the arm comes nearer than {1e3 * self._links.margin:.1f} mm to the map on its approach"
+                kind = "bring the arm within the margin of the map"
                 continue
             clearance = float(back.path.certificate.clearance)
             return Reached(q, back.path.waypoints[::-1].copy(), clearance, self._limits(q))

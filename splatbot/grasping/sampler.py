@@ -42,7 +42,9 @@ class GraspSampler:
             come close to the target.
         min_observations: Gaussians with fewer observing keyframes do not count as obstacles; see
             :class:`splatbot.collision.GaussianCollisionField`.
-        margin: clearance to keep from the map [m].
+        margin: clearance that arm and hand keep from the map [m].
+        arm_margin: the same for the links before the hand alone [m]. The hand has to come close, and is checked
+            against raw depth.
         moving: (V, 4) balls (x, y, z, radius) [m, world] of regions where motion was observed; see
             :func:`splatbot.collision.find_moving`. Grasps that avoid them score higher.
 
@@ -63,6 +65,7 @@ class GraspSampler:
         n_sigma: float = 1.0,
         min_observations: int = 1,
         margin: float = 0.0,
+        arm_margin: float = 0.0,
         moving: Array | None = None,
     ) -> None:
         if observers is not None and observers.shape != (len(scene.model), 3):
@@ -72,7 +75,7 @@ class GraspSampler:
         self.scene, self.robot, self.observers, self.views = scene, robot, observers, tuple(views)
         self.raw = raw
         self.hand = hand_of(robot)
-        self.margin, self.n_sigma = margin, n_sigma
+        self.margin, self.arm_margin, self.n_sigma = margin, arm_margin, n_sigma
         self.moving = None if moving is None or not len(moving) else np.asarray(moving, dtype=np.float64)
         self.min_observations = min_observations
         self.field = self.collision_field(scene.model)
@@ -121,4 +124,5 @@ class GraspSampler:
         return self._make_reach(*fields)
 
     def _arm_reach(self, around: GaussianCollisionField, whole: GaussianCollisionField) -> ReachabilityCheck:
-        return ArmReach(self.robot, self.scene.T_world_base, around, whole, margin=self.margin)
+        base = self.scene.T_world_base
+        return ArmReach(self.robot, base, around, whole, margin=self.margin, arm_margin=self.arm_margin)

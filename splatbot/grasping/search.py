@@ -16,9 +16,9 @@ from splatbot.gaussians import GaussianModel
 from splatbot.grasping.affordance import Target
 from splatbot.grasping.antipodal import Pairs, PairSearch, antipodal_pairs
 from splatbot.grasping.hands import CONSTANTS as HANDS
-from splatbot.grasping.hands import Hands, measure_hands, palm_free, place_hands
+from splatbot.grasping.hands import Hands, measure_hands, palm_free, place_hands, usable_opening
 from splatbot.grasping.measured import CONSTANTS as MEASURED
-from splatbot.grasping.measured import RawDepth, closed_width, contact_distances, hand_penetration
+from splatbot.grasping.measured import RawDepth, blind, closed_width, contact_distances, hand_penetration
 from splatbot.grasping.obstacles import around_target
 from splatbot.grasping.options import GraspOptions
 from splatbot.grasping.reach import ReachabilityCheck
@@ -169,7 +169,7 @@ class Search:
     def _contacts(self, samples: int) -> None:
         self.found: PairSearch = antipodal_pairs(
             self.surface,
-            stroke=self.s.hand.stroke,
+            stroke=usable_opening(self.s.hand.stroke),
             friction=self.o.friction,
             samples=samples,
             up=self.s.scene.up,
@@ -281,7 +281,8 @@ class Search:
     def _outside_measured(self, scored: _Scored) -> _Scored:
         """Return the hands without confirmed points of raw depth in them, with the score term of their contacts.
 
-        Points that stand out under a pad beyond the planned contacts stop the fingers earlier.
+        Hands that should not be executed come last. Points that stand out under a pad beyond the planned contacts stop
+        the fingers earlier.
         """
         assert self.measured is not None
         hands = scored.hands
@@ -301,7 +302,9 @@ class Search:
                 reason = f"has measured depth under its pads, so that it closes {1e3 * wider[k]:.0f} mm wider"
             self.log.best = self._grasp(scored, k, rejected=reason)
         kept = scored.select(free)
-        return kept.select(np.lexsort((-kept.totals, kept.terms["measured"] == 0.0)))  # without evidence last
+        assert self.s.raw is not None
+        unsafe = blind(away[free], self.s.raw.unseen(kept.hands, self.s.hand)).any(axis=1)
+        return kept.select(np.lexsort((-kept.totals, unsafe | (kept.terms["measured"] == 0.0))))
 
     def _reached(
         self, scored: _Scored, reach: ReachabilityCheck | None, avoid_moving: ReachabilityCheck | None
@@ -374,7 +377,8 @@ class Search:
         assert grasp.depth_distance is not None
         away = np.minimum(grasp.depth_distance, contact_distances(grasp.contacts, points))
         measured = float((away <= MEASURED.contact_distance).mean())
-        return replace(_with_terms(grasp, {"measured": measured}), width=width, depth_distance=away), ""
+        known = _with_terms(grasp, {"measured": measured})
+        return replace(known, width=width, depth_distance=away, unseen=raw.unseen(hands, self.s.hand)[0]), ""
 
     def _scored(self, hands: Hands, clearance: Array) -> _Scored:
         terms = hand_terms(
@@ -439,12 +443,18 @@ class Search:
         """Return why a grasp should not be executed; empty if it may be."""
         if grasp.confidence < self.o.min_confidence:
             return f"has a confidence of {grasp.confidence:.2f}, less than {self.o.min_confidence:g}"
-        if self.o.accept_implied or grasp.depth_distance is None or not all(grasp.implied):
+        if self.o.accept_implied or grasp.depth_distance is None or grasp.unseen is None:
             return ""
-        if np.isinf(grasp.depth_distance).any():
+        if np.isinf(grasp.depth_distance).any() and all(grasp.implied):
             return "has no contact at measured depth, nor any depth near it"
-        away = " and ".join(f"{1e3 * value:.0f}" for value in grasp.depth_distance)
-        return f"has no contact at measured depth, which is {away} mm away"
+        if all(grasp.implied):
+            away = " and ".join(f"{1e3 * value:.0f}" for value in grasp.depth_distance)
+            return f"has no contact at measured depth, which is {away} mm away"
+        for hidden, away, unseen in zip(grasp.blind, grasp.depth_distance, grasp.unseen, strict=True):
+            if hidden:
+                why = f"{unseen:.0%} of its face is in unseen space"
+                return f"has a finger where the object may continue: {why}, {1e3 * away:.0f} mm from measured depth"
+        return ""
 
     def _notes(self, grasps: Sequence[Grasp]) -> tuple[str, ...]:
         notes = []
@@ -461,7 +471,7 @@ class Search:
         completed = float(1.0 - self.surface.observed.mean())
         if completed > 0.05:
             notes.append(f"{completed:.0%} of its surface was not observed and is completed.")
-        if np.isfinite(self.found.narrowest):
+        if np.isfinite(self.found.narrowest) and not grasps:
             narrowest, opens = 1e3 * self.found.narrowest, 1e3 * self.s.hand.stroke
             notes.append(
                 f"The narrowest of its sides that are too wide are {narrowest:.0f} mm apart, and the hand opens "

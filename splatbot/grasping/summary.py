@@ -45,6 +45,7 @@ def _grasp_summary(grasp: Grasp) -> dict[str, Any]:
         "normals": grasp.normals.tolist(),
         "contact_depth_distance_m": _finite(grasp.depth_distance),
         "contact_implied": list(grasp.implied) if grasp.depth_distance is not None else None,
+        "finger_unseen": None if grasp.unseen is None else grasp.unseen.round(3).tolist(),
         "approach": grasp.approach,
         "terms": dict(grasp.terms),
         "total": grasp.total,

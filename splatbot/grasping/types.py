@@ -9,7 +9,7 @@ import numpy as np
 
 from splatbot.errors import SplatbotError
 from splatbot.grasping.affordance import Target
-from splatbot.grasping.measured import CONSTANTS
+from splatbot.grasping.measured import CONSTANTS, blind
 from splatbot.grasping.score import confidence
 from splatbot.protocols import Array
 
@@ -37,6 +37,8 @@ class Grasp:
         rejected: reason for which the grasp is rejected; empty for an accepted grasp.
         depth_distance: (2,) distance of each contact from the nearest confirmed point of raw depth [m], inf without
             such points near the target. If None, it was not checked.
+        unseen: (2,) share of the inner face of each contact's finger that no frame saw to be free, 0..1. If None, it
+            was not checked.
     """
 
     T_world_tcp: Array
@@ -54,6 +56,7 @@ class Grasp:
     approach_path: Array | None = field(default=None, repr=False)
     rejected: str = ""
     depth_distance: Array | None = None
+    unseen: Array | None = None
 
     @property
     def confidence(self) -> float:
@@ -66,6 +69,16 @@ class Grasp:
         if self.depth_distance is None:
             return ()
         return tuple(bool(away > CONSTANTS.contact_distance) for away in self.depth_distance)
+
+    @property
+    def blind(self) -> tuple[bool, ...]:
+        """Return for each contact whether its finger enters unseen space, in which the object may continue.
+
+        A contact within 6 mm of measured depth is where it is expected. The result is empty if that was not checked.
+        """
+        if self.depth_distance is None or self.unseen is None:
+            return ()
+        return tuple(bool(b) for b in blind(self.depth_distance, self.unseen))
 
     @property
     def avoids_moving(self) -> bool:

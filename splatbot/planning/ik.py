@@ -159,8 +159,8 @@ def solve_ik(
 
     The starts are ``near``, the home posture and uniformly random configurations. While none of them gives a
     free solution, further random starts follow, up to 512 in total. With ``seeds=1`` only ``near`` is solved, so that a
-    sequence of calls follows one branch of solutions. Equal arguments give equal solutions. Joints that can turn further
-    than once take the turn nearest to ``near``.
+    sequence of calls follows one branch of solutions. Equal arguments give equal solutions. Joints that can turn
+    further than once take the turn nearest to ``near``.
 
     Args:
         robot: the arm.

@@ -33,8 +33,8 @@ class RunMarginConstants:
     """Number of other frames [1] that confirm a surface point. The audit requires two; a margin must also cover surface
     that only two frames saw."""
     region: float = 0.2
-    """Distance [m] of the arm's sphere centers within which points belong to the region of a motion. A larger one
-    averages over more surface."""
+    """Distance [m] of the arm's sphere centers, or of a target, within which points belong to the region of a motion. A
+    larger one averages over more surface."""
     cell: float = 0.02
     """Edge [m] of the cells of which one center each bounds the distances, before the exact search among few points."""
 
@@ -76,6 +76,11 @@ class AuditedError:
         few = np.count_nonzero(gap <= distance) < least
         chosen = near[gap <= (np.partition(gap, least - 1)[least - 1] if few else distance)]
         return AuditedError(self.points[chosen], self.error[chosen])
+
+    def in_region(self, centers: ArrayLike, confidence: float = CONSTANTS.confidence) -> AuditedError:
+        """Return the points near the ``centers`` (C, 3) [m, world], at least as many as the confidence (0..1) needs."""
+        least = min(len(self), int(np.ceil(1.0 / max(1.0 - confidence, 1e-12))))
+        return self.near(centers, CONSTANTS.region, least)
 
     def quantile(self, confidence: float) -> float:
         """Return an error [m] that a fraction ``confidence`` (0..1) of the points does not exceed; 0 without points.

@@ -12,7 +12,6 @@ from splatbot.collision import RobotSpheres
 from splatbot.errors import InputError
 from splatbot.planning import GaussianRRTStar, JointTrajectory, Path, PlanResult, time_path
 from splatbot.protocols import Array, HasHand
-from splatbot.results.margin import CONSTANTS as MARGIN
 from splatbot.results.margin import AuditedError
 
 
@@ -155,5 +154,4 @@ def _timed(planner: GaussianRRTStar, path: Path, speed: float, acceleration: flo
 
 def _around(arm: RobotSpheres, q: Array, error: AuditedError, confidence: float) -> AuditedError:
     """Return the points near the arm, at least as many as the confidence needs."""
-    least = min(len(error), int(np.ceil(1.0 / max(1.0 - confidence, 1e-12))))
-    return error.near(arm.centers(np.atleast_2d(q)).reshape(-1, 3), MARGIN.region, least)
+    return error.in_region(arm.centers(np.atleast_2d(q)).reshape(-1, 3), confidence)

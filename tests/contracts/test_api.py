@@ -185,6 +185,8 @@ def test_a_plan_into_the_wall_is_a_problem_with_moveit_s_code(robot: Client) -> 
 def test_grasps_of_a_box_are_as_wide_as_it_is_and_one_that_is_not_there_is_a_problem(robot: Client) -> None:
     found = robot.grasps("table", target="box", base={})
     best = found["grasps"][0]
+    assert (found["margin_m"], found["arm_margin_m"]) == (0.0, 0.0)
+    assert found["margin_source"] == "unknown: the map has no recording; 0 is assumed"
     assert best["width_m"] == pytest.approx(0.04, abs=0.005) or best["width_m"] == pytest.approx(0.06, abs=0.005)
     assert best["q"] is not None
     with pytest.raises(ServiceError) as caught:

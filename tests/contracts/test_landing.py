@@ -48,8 +48,8 @@ def test_objects_name_their_unit_and_what_does_not_fit_the_hand(table: Service) 
     for number, item in enumerate(body["objects"]):
         assert item["target"] == f"object {number}"
         _, short, height = item["size_m"]
-        assert item["graspable_by_size"] == (short <= 0.08 and height >= 0.012)
-        assert short <= 0.08 or "the hand opens 80 mm" in item["obstacle"]
+        assert item["graspable_by_size"] == (short <= 0.076 and height >= 0.012)
+        assert short <= 0.076 or "the hand opens 80 mm" in item["obstacle"]
 
 
 def test_distances_are_in_sigmas_and_in_metres(table: Service) -> None:

@@ -11,11 +11,13 @@ import numpy as np
 import pytest
 
 from splatbot.cli import main
+from splatbot.collision import GaussianCollisionField
 from splatbot.gaussians import GaussianModel, Snapshot
 from splatbot.results.folder import RunFolder
 from splatbot.results.margin import audited_error
 from splatbot.robots.in_view import reopen_log
 from splatbot.robots.panda import panda
+from splatbot.services.margins import margin_source
 from splatbot.services.settings import ServiceSettings
 from splatbot.services.store import MapStore
 from tests.contracts.conftest import Service, running, wall
@@ -57,7 +59,7 @@ def plan(service: Service, name: str, **request: Any) -> Any:
 
 def test_the_default_margin_of_a_recorded_map_is_its_audited_error(service: Service, recorded: Path) -> None:
     answer = plan(service, "table").json()
-    assert answer["margin_source"] == "audited error of the map in the region of the motion"
+    assert answer["margin_source"] == "audited error of the map where the arm moves"
     covers = answer["covers"]
     assert (covers["margin_from"], covers["unknown_space"], covers["base"]) == ("audit", "free", False)
     assert covers["region_points"] == 1000  # far from all points, so that the nearest count
@@ -93,6 +95,18 @@ def test_a_recording_that_cannot_be_read_is_stated_and_refused_where_it_was_aske
     assert answer["margin_source"].startswith("unknown: the recording cannot be audited (")
     asked = plan(service, "lost", margin="auto")
     assert 400 <= asked.status_code < 500
+
+
+def test_the_margin_of_grasps_is_the_error_of_their_own_field(service: Service, recorded: Path) -> None:
+    served = service.store.get("table")
+    thin = GaussianCollisionField(GaussianModel.load(recorded / "map.ply"), 1.0)
+    source, plans = margin_source(served, None, thin), margin_source(served, None)
+    assert source.error is not None
+    assert plans.error is not None
+    expected = audited_error(recorded, reopen_log(RunFolder(recorded)), thin)
+    np.testing.assert_array_equal(source.error.error, expected.error)
+    assert source.error.error.mean() > plans.error.error.mean()  # thinner ellipsoids leave more of the surface out
+    assert margin_source(served, None, thin).error is source.error  # audited once
 
 
 @pytest.mark.parametrize("margin", [-0.1, "much", "1e400", float("1e300"), True])

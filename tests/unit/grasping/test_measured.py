@@ -192,6 +192,55 @@ def test_contacts_on_a_side_that_no_frame_saw_are_implied() -> None:
         assert g.terms["measured"] == pytest.approx(1.0 - np.mean(g.implied))
 
 
+def _over_the_box(yaw: float) -> Hands:
+    """Return a hand above the box that closes along ``yaw``, with a finger on each side."""
+    T = np.eye(4)
+    T[:3, 1], T[:3, 2] = [np.cos(yaw), np.sin(yaw), 0], [0, 0, -1]
+    T[:3, 0] = np.cross(T[:3, 1], T[:3, 2])
+    T[:3, 3] = [0.45, 0.1, 0.06]
+    return Hands.one(T, 0.08)
+
+
+@pytest.mark.parametrize("yaw", np.linspace(0.0, 2 * np.pi, 5)[:-1])
+def test_a_finger_in_the_shadow_of_the_object_is_unseen_and_the_one_before_it_is_seen(yaw: float) -> None:
+    assert HAND is not None
+    tall = Block(center=(0.45, 0.1, 0.1), size=(0.06, 0.06, 0.2), yaw=0.0)
+    one_side = raw(TABLE, tall, turns=np.array([yaw]))  # the camera is where the fingers close along
+    behind, before = one_side.unseen(_over_the_box(yaw), HAND)[0]
+    assert behind > 0.95
+    assert before == 0.0
+    around = raw(TABLE, tall).unseen(_over_the_box(yaw), HAND)
+    assert around.max() == 0.0
+    assert RawDepth((), FLOOR, QUAD).unseen(_over_the_box(yaw), HAND).min() == 1.0
+
+
+def test_pixels_without_depth_show_no_free_space() -> None:
+    assert HAND is not None
+    depth, camera, T = views(TABLE)[0]
+    hand = _over_the_box(0.0)
+    assert RawDepth(((depth, camera, T),), FLOOR, QUAD).unseen(hand, HAND).max() == 0.0
+    assert RawDepth(((np.zeros_like(depth), camera, T),), FLOOR, QUAD).unseen(hand, HAND).min() == 1.0
+    assert RawDepth(((np.full_like(depth, np.nan), camera, T),), FLOOR, QUAD).unseen(hand, HAND).min() == 1.0
+
+
+def test_a_finger_that_enters_unseen_space_is_not_offered() -> None:
+    half = raw(TABLE, *OBJECTS.values(), turns=np.linspace(-0.4, 0.4, 6))
+    result = grasps_with(half)
+    assert not any(any(g.blind) for g in result.grasps)
+    allowed = GraspSampler(scene(), panda(), raw=half, hand_only=True).sample(
+        target_of(scene(), BOX, "box"), GraspOptions(accept_implied=True, wanted=100)
+    )
+    hidden = [g for g in allowed.grasps if any(g.blind)]
+    assert hidden
+    for g in hidden:
+        assert g.depth_distance is not None
+        assert g.unseen is not None
+        assert ((g.depth_distance > CONSTANTS.unseen_from) & (g.unseen > CONSTANTS.max_unseen)).any()
+    every = grasps_with(everything())
+    assert every.grasps
+    assert not every.doubtful
+
+
 def test_results_state_the_support_of_each_contact_and_null_where_it_was_not_checked() -> None:
     known = summary(grasps_with(everything()))["grasps"][0]
     assert known["contact_implied"] == [False, False]

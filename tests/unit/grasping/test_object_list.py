@@ -36,6 +36,7 @@ def test_an_object_beyond_the_arm_is_listed_with_its_distance() -> None:
     fitting = [item for item in found if item.fits]
     assert fitting
     assert all("from the first joint, and the arm reaches" in item.obstacle for item in fitting)
+    assert {item.verdict for item in fitting} == {"too far"}
     assert not any("reaches" in item.obstacle for item in list_objects(near, panda()))
 
 
@@ -49,9 +50,28 @@ def test_planes_name_height_and_size() -> None:
 def test_what_is_wider_than_the_hand_or_flat_is_not_offered() -> None:
     item = scene().objects[0]
     cube = replace(item, size=np.array([0.086, 0.085, 0.085]))
-    assert "85 mm apart, and the hand opens 80 mm" in obstacle(cube, 0.08)
-    assert obstacle(cube, 0.14) == ""
-    assert "flat" in obstacle(replace(item, size=np.array([0.2, 0.05, 0.004])), 0.08)
+    for stroke in (0.08, 0.085, 0.0885):  # the hand needs 2 mm at each pad
+        wide = obstacle(cube, stroke)
+        assert wide is not None
+        assert wide.verdict == "too wide"
+        assert f"85 mm apart, and the hand opens {1e3 * stroke:.0f} mm" in wide.reason
+    assert obstacle(cube, 0.0895) is None
+    flat = obstacle(replace(item, size=np.array([0.2, 0.05, 0.004])), 0.08)
+    assert flat is not None
+    assert flat.verdict == "too flat"
+    none = obstacle(cube, 0.0)
+    assert none is not None
+    assert none.verdict == "no hand"
+
+
+def test_what_hangs_in_the_air_is_told_from_what_stands() -> None:
+    found = list_objects(scene(), panda())
+    assert all(item.on_support for item in found)
+    raised = scene()
+    rows = raised.objects[0].rows
+    raised.points[rows, 2] += 0.1
+    lifted = list_objects(raised, panda())
+    assert [item.on_support for item in lifted] == [item.number != 0 for item in found]
 
 
 def test_flat_patches_are_no_mugs() -> None:

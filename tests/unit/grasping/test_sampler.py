@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from functools import cache
 
 import numpy as np
@@ -18,7 +19,7 @@ from splatbot.gaussians import GaussianModel
 from splatbot.geometry import inverse, look_at, rotation_to_quat, transform_points
 from splatbot.grasping.affordance import Target
 from splatbot.grasping.options import GraspOptions
-from splatbot.grasping.reach import Reached
+from splatbot.grasping.reach import ArmReach, Reached
 from splatbot.grasping.sampler import GraspSampler
 from splatbot.grasping.score import WEIGHTS
 from splatbot.grasping.shape_completion import target_surface
@@ -202,6 +203,32 @@ def test_candidates_of_both_searches_are_counted() -> None:
     for reason, count in more.rejected.items():
         assert twice.rejected[reason] == once.rejected.get(reason, 0) + count
     assert set(twice.rejected) >= set(once.rejected)
+
+
+def test_the_links_before_the_hand_keep_the_margin_of_the_arm_while_the_hand_comes_close() -> None:
+    target, margin = target_of(scene(), BOX, "box"), 0.04
+    result = GraspSampler(scene(), panda(), arm_margin=margin).sample(target)
+    assert result.grasps
+    assert min(g.clearance for g in result.grasps) <= 0.03  # of the hand, which is nearer
+    rows = np.delete(np.arange(len(scene().model)), target.rows)
+    around = GaussianCollisionField(scene().model.select(torch.from_numpy(rows)), 1.0)
+    spheres = panda().spheres()
+    links = spheres.link < 7
+    for g in result.grasps:
+        assert g.approach_path is not None
+        way = np.concatenate([np.linspace(a, b, 20) for a, b in itertools.pairwise(g.approach_path)])
+        for T in panda().fk(way):
+            T = scene().T_world_base @ T
+            placed = T[spheres.link[links]]
+            at = np.einsum("sij,sj->si", placed[:, :3, :3], spheres.centers[links]) + placed[:, :3, 3]
+            high = spheres.link[links] > 0  # the base stands on the table
+            gap = around.clearance(at[high], cut=0.5).distance - spheres.radii[links][high]
+            assert gap.min() > margin - 1e-6
+    none = GraspSampler(scene(), panda(), arm_margin=0.4).sample(target)
+    assert not none.grasps
+    assert none.rejected["hands: bring the arm within the margin of the map"] > 0
+    with pytest.raises(InputError, match="arm_margin"):
+        ArmReach(panda(), np.eye(4), around, arm_margin=-1.0)
 
 
 INNER, OUTER, HIGH, RIM = 0.021, 0.0325, 0.016, 0.0055  # [m] of a low ring
