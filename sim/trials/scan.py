@@ -38,6 +38,10 @@ from splatbot.slam import Slam
 _TARGET, _DISTANCE = np.array([0.5, 0.0, 0.05]), 0.6  # [m] point that the camera is aimed at, and the distance to it
 
 
+Rings = tuple[tuple[float, tuple[int, ...]], ...]
+"""[deg] elevation and azimuths of each ring of views around the table."""
+
+
 @dataclass(frozen=True)
 class TrialScanConstants:
     """Constants of the scan of a trial.
@@ -50,7 +54,7 @@ class TrialScanConstants:
         pose_sigma: [m], [rad] standard deviation of the camera pose by the arm's joints.
     """
 
-    rings: tuple[tuple[float, tuple[int, ...]], tuple[float, tuple[int, ...]]] = (
+    rings: Rings = (
         (45.0, (-130, -80, -40, 0, 40, 80)),
         (65.0, (80, 40, 0, -40, -80)),
     )
@@ -112,7 +116,14 @@ def usable_depth(frame: Frame) -> NDArray[np.float32]:
     return np.where(frame.valid & (frame.depth < CONSTANTS.max_depth), frame.depth, 0.0).astype(np.float32)
 
 
-def scan_scene(trial: TrialScene, *, frames: int = 32, width: int = 320, config: Config | None = None) -> TrialScan:
+def scan_scene(
+    trial: TrialScene,
+    *,
+    frames: int = 32,
+    width: int = 320,
+    config: Config | None = None,
+    rings: Rings = CONSTANTS.rings,
+) -> TrialScan:
     """Move the camera over the scene and map its frames.
 
     The arm's joints give each camera pose with an error of 0.5 mm and 0.5 mrad, which tracking refines.
@@ -122,11 +133,12 @@ def scan_scene(trial: TrialScene, *, frames: int = 32, width: int = 320, config:
         frames: number of frames.
         width: of an image [px]; the height is 3/4 of it.
         config: of mapping. If None, it is finer than the default and keeps the means fixed (:data:`MAPPING`).
+        rings: views that the camera passes, from first to last.
 
     Raises:
         UnseenError: no image shows the target.
     """
-    log = _log(trial, frames, width)
+    log = _log(trial, camera_path(frames, rings), width)
     true = log.ground_truth.T_world_camera
     rng = np.random.default_rng(trial.seed)
     sigma = np.repeat(CONSTANTS.pose_sigma, 3)
@@ -160,15 +172,15 @@ def scan_scene(trial: TrialScene, *, frames: int = 32, width: int = 320, config:
 
 
 @cache
-def camera_path(frames: int) -> Array:
-    """Return the joints (F, J) of a path around the table's centre, with a higher ring on the way back.
+def camera_path(frames: int, rings: Rings = CONSTANTS.rings) -> Array:
+    """Return the joints (F, J) of a path around the table's centre, by default with a higher ring on the way back.
 
     Raises:
         InputError: a pose cannot be reached.
     """
     robot = panda()
     near, knots = robot.home, []
-    for steep, turns in CONSTANTS.rings:
+    for steep, turns in rings:
         for turn in turns:
             t, s = np.radians([turn, steep])
             eye = _TARGET + _DISTANCE * np.array([np.cos(t) * np.cos(s), np.sin(t) * np.cos(s), np.sin(s)])
@@ -183,14 +195,13 @@ def camera_path(frames: int) -> Array:
     return np.stack([np.interp(at, np.arange(len(knots)), column) for column in np.array(knots).T], axis=1)
 
 
-def _log(trial: TrialScene, frames: int, width: int) -> WristLog:
+def _log(trial: TrialScene, joints: Array, width: int) -> WristLog:
     objects = [obj for obj in trial.scene.objects if obj.movable]
     still = [surface for k, obj in enumerate(objects) for surface in surfaces_of(obj, seed=k)]
     moving = {}
     for obj in trial.scene.carried:
         shown = surfaces_of(obj, placed=False)
         moving[obj.name] = Moving(shown, partial(_pose_on_path, obj))
-    joints = camera_path(frames)
     return WristLog(
         panda(), joints, [_TABLE, *still], T_scene_base=np.eye(4), width=width, rate=CONSTANTS.rate, moving=moving
     )

@@ -87,25 +87,29 @@ class GaussianStack:
     def learn(self, scan: TrialScan) -> StackMap:
         """Implement :meth:`Stack.learn`."""
         begin = time.perf_counter()
+        sampler = self.sampler(scan)
+        seconds = scan.seconds + time.perf_counter() - begin
+        world = sampler.scene.model.nbytes + sampler.field.nbytes
+        return StackMap(
+            sampler.scene, lambda target: (sampler, MapPickPlanner(sampler, target, OPTIONS)), world, seconds
+        )
+
+    def sampler(self, scan: TrialScan, *, hand_only: bool = False) -> GraspSampler:
+        """Return the grasp sampler on the map of a scan, for the hand alone or with the arm."""
         # Removes flying pixels at edges and traces of moving objects, which more frames contradict than support.
         evidence = gather_evidence(scan.snapshot.model, scan.views)
         solid = np.flatnonzero(~evidence.seen_through)
         moving = find_moving(scan.snapshot.model, evidence)
-        model = scan.snapshot.model.select(torch.from_numpy(solid))
-        scene = segment(model, scan.T_world_base, cut=False)
-        observers = scan.observers[solid]
-        sampler = GraspSampler(
-            scene,
+        return GraspSampler(
+            segment(scan.snapshot.model.select(torch.from_numpy(solid)), scan.T_world_base, cut=False),
             panda(),
-            observers=observers,
+            hand_only=hand_only,
+            observers=scan.observers[solid],
             views=scan.views,
             raw=RawDepth(tuple(scan.views), SENSOR.sigma_depth_floor, SENSOR.sigma_depth_quad),
             min_observations=CONSTANTS.min_observations,
             moving=moving,
         )
-        seconds = scan.seconds + time.perf_counter() - begin
-        world = model.nbytes + sampler.field.nbytes
-        return StackMap(scene, lambda target: (sampler, MapPickPlanner(sampler, target, OPTIONS)), world, seconds)
 
 
 @dataclass(frozen=True, eq=False)

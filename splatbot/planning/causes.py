@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from splatbot.collision import GaussianCollisionField, RobotSpheres
+from splatbot.geometry import inverse, transform_points
 from splatbot.planning.problem import Cause
 from splatbot.protocols import Array, KinematicChain
 
@@ -31,7 +32,9 @@ def limit_violation(chain: KinematicChain, q: Array) -> Cause | None:
     """Return the joint of ``q`` (J,) that exceeds its limits most, or None if all joints are within their limits."""
     excess = np.maximum(chain.lower - q, q - chain.upper)
     joint = int(np.argmax(excess))
-    return Cause(joint=joint, depth=float(excess[joint])) if excess[joint] > CONSTANTS.limit_slack else None
+    if excess[joint] <= CONSTANTS.limit_slack:
+        return None
+    return Cause(joint=joint, depth=float(excess[joint]), name=chain.names[joint])
 
 
 def collision(arm: RobotSpheres, field: GaussianCollisionField, q: Array) -> Cause:
@@ -42,8 +45,27 @@ def collision(arm: RobotSpheres, field: GaussianCollisionField, q: Array) -> Cau
     nearest = arm.clearance(field, q[None], cut=CONSTANTS.search_distance)
     clearance, pair = self_clearance(arm, q)
     if clearance < nearest.distance[0]:
-        return Cause(int(pair[0]), int(pair[1]), -1, -clearance)
-    return Cause(int(nearest.link[0]), -1, int(nearest.index[0]), -float(nearest.distance[0]))
+        return Cause(int(pair[0]), int(pair[1]), -1, -clearance, name=_moves(arm, pair[0]))
+    link, row = int(nearest.link[0]), int(nearest.index[0])
+    if link < 0:
+        return Cause()
+    return Cause(
+        link, -1, row, -float(nearest.distance[0]), name=_moves(arm, link), at_base=_deepest(arm, field, q, link)
+    )
+
+
+def _moves(arm: RobotSpheres, link: int) -> str:
+    """Return the name of the joint that moves a link, "" for the base."""
+    return arm.robot.chain.names[link - 1] if link > 0 else ""
+
+
+def _deepest(arm: RobotSpheres, field: GaussianCollisionField, q: Array, link: int) -> tuple[float, float, float]:
+    """Return the centre of the link's sphere that is deepest in the map at ``q`` (J,), in the base frame [m]."""
+    of = arm.spheres.link == link
+    at = arm.centers(q[None])[0][of]
+    gap = field.clearance(at).distance - arm.spheres.radii[of]
+    x, y, z = transform_points(inverse(arm.T_world_base), at[int(np.argmin(gap))][None])[0]
+    return float(x), float(y), float(z)
 
 
 def self_clearance(arm: RobotSpheres, q: Array) -> tuple[float, tuple[int, int]]:

@@ -79,6 +79,8 @@ class Cause:
         gaussian: row of the touched Gaussian in the model, -1 if the arm touches itself.
         depth: penetration depth [m]; below 0 it is clearance.
         joint: index of the joint outside its limits, -1 if all are within; ``depth`` is then the excess [rad or m].
+        name: name of that joint, or of the joint that moves the link; "" for the base.
+        at_base: (3,) centre of the sphere that is deepest in the map, in the base frame [m]; None without one.
     """
 
     link: int = -1
@@ -86,15 +88,20 @@ class Cause:
     gaussian: int = -1
     depth: float = 0.0
     joint: int = -1
+    name: str = ""
+    at_base: tuple[float, float, float] | None = None
 
     def __str__(self) -> str:
         if self.joint >= 0:
-            return f"joint {self.joint} is {self.depth:.4g} beyond its limit"
+            named = f" ({self.name})" if self.name else ""
+            return f"joint {self.joint}{named} is {self.depth:.4g} beyond its limit"
         if self.link < 0:
             return "no obstacle is found"
+        link = f"link {self.link}" + (f" (after {self.name})" if self.name else "")
         if self.other >= 0:
-            return f"link {self.link} touches link {self.other}, {1e3 * self.depth:.1f} mm deep"
-        return f"link {self.link} is {1e3 * self.depth:.1f} mm deep in Gaussian {self.gaussian}"
+            return f"{link} touches link {self.other}, {1e3 * self.depth:.1f} mm deep"
+        at = "" if self.at_base is None else f" at ({', '.join(f'{x:.2f}' for x in self.at_base)}) m from the base"
+        return f"{link} is {1e3 * self.depth:.1f} mm deep in the map{at}, in Gaussian {self.gaussian}"
 
 
 @dataclass(frozen=True, eq=False)

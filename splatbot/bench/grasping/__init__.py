@@ -24,7 +24,7 @@ class GraspingSettings(Settings):
     surfaces, and the angle between the true normals and the line through the contacts.
 
     With runs, it samples grasps of every object of their maps instead. It compares hands and contacts with raw depth
-    of more frames than the sampler used.
+    of more frames than the sampler used. With one-sided scans it compares fingers with true shapes.
 
     Examples:
         splatbot bench grasping
@@ -32,6 +32,7 @@ class GraspingSettings(Settings):
         splatbot bench grasping --quick --json figures.json
         splatbot bench grasping --run runs/desk runs/shelf
         splatbot bench grasping --reliability 45
+        splatbot bench grasping --one-sided 60 --first 0
 
     Args:
         gaussians: Sizes of the maps. Samples are varied on the first.
@@ -39,6 +40,7 @@ class GraspingSettings(Settings):
         run: Folders of runs with a scene.yaml.
         reliability: Number of simulated scenes in which up to five grasps each are executed, to compare confidence and
             success (half a minute a scene).
+        one_sided: Number of simulated scenes that are scanned from one side (ten seconds a scene).
         first: Seed of the first of these scenes.
     """
 
@@ -49,12 +51,13 @@ class GraspingSettings(Settings):
     samples: Annotated[tuple[int, ...], arg(metavar="N ...")] = (50, 100, 200, 400, 800, 1600)
     run: Annotated[tuple[Path, ...], arg(metavar="RUN ...")] = ()
     reliability: Annotated[int, arg(metavar="SCENES")] = 0
+    one_sided: Annotated[int, arg(metavar="SCENES")] = 0
     first: Annotated[int, arg(metavar="SEED")] = 400
 
     def validate(self) -> None:
         """Raise an InputError for numbers below 1."""
-        if self.reliability < 0 or self.first < 0:
-            raise InputError("is negative.", field="--reliability, --first", hint="give 0 or more")
+        if min(self.reliability, self.one_sided, self.first) < 0:
+            raise InputError("is negative.", field="--reliability, --one-sided, --first", hint="give 0 or more")
         if not self.gaussians or min((*self.gaussians, *self.samples)) < 1:
             raise InputError("has a number below 1.", field="--gaussians, --samples", hint="give positive numbers")
 
@@ -64,6 +67,10 @@ def _measure(settings: GraspingSettings, report_progress: ReportProgress) -> Res
         from splatbot.bench.grasping.reliability import run_reliability
 
         return run_reliability(settings, report_progress)
+    if settings.one_sided:
+        from splatbot.bench.grasping.one_sided import run_one_sided
+
+        return run_one_sided(settings, report_progress)
     if settings.run:
         from splatbot.bench.grasping.recorded import run_recorded
 
@@ -88,6 +95,7 @@ BENCHMARK = Benchmark(
         Table("By size of the map", lambda row: "Gaussians" in row.case, layout=per_metric),
         Table("By samples", lambda row: "samples" in row.case, layout=per_metric),
         Table("Reliability", lambda row: "confidence" in row.case or "all " in row.case or "fit" in row.case),
-        Table("Maps of recordings", lambda row: "/" in row.case, layout=per_metric),
+        Table("Scans from one side", lambda row: "one side" in row.case, layout=per_metric),
+        Table("Maps of recordings", lambda row: "/" in row.case and "side" not in row.case, layout=per_metric),
     ),
 )

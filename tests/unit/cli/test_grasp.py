@@ -28,7 +28,7 @@ def test_ranked_grasps_are_printed_written_and_drawn(run: RunCommand, map_file: 
     out = tmp_path / "out"
     answer = run("grasp", "--map", map_file, *BASE, "--target", "red box", "--wanted", 3, "--out", out)
     assert answer.code == 0, answer.err
-    for word in ("conf.", "width", "clear", "red box", "by rules", "errors are not covered"):
+    for word in ("conf.", "width", "clear", "red box", "by rules", "errors of the map are not covered"):
         assert word in answer.out
     assert "closure" not in answer.out
     found = json.loads((out / "grasp.json").read_text())
