@@ -196,6 +196,11 @@ class PlanRequest(Request):
     confidence: Annotated[float, Field(ge=0, le=1)] = Field(
         0.999, description='share of the confirmed surface that the margin "auto" covers'
     )
+    unknown: Literal["free", "cautious", "occupied"] = Field(
+        "free",
+        description='space that no frame observed: "occupied" is all of it, "cautious" where two frames looked and '
+        "measured no depth. Needs a recording, and seconds for the first plan of a robot and base",
+    )
     budget_ms: Annotated[float, Field(gt=0, allow_inf_nan=False)] = Field(100.0, description="time to plan")
     seed: Annotated[int, Field(ge=0, lt=2**32)] = Field(0, description="seed of the search")
     speed: Annotated[float, Field(gt=0, le=1)] = Field(

@@ -10,6 +10,7 @@ from fastapi import APIRouter, Depends, Path, Request, Response
 from splatbot.geometry import inverse
 from splatbot.planning import GaussianRRTStar, JointGoal, PoseGoal
 from splatbot.planning.ik import solve_ik
+from splatbot.results.unknown import refuse_unknown
 from splatbot.services.arms import known_robot
 from splatbot.services.codecs import answer, answers, body_of, request_body
 from splatbot.services.dependencies import ServedAfterFrames, Service, problems
@@ -19,6 +20,7 @@ from splatbot.services.problems import TooLargeError
 from splatbot.services.robots_in_maps import arm_in, base_in, joints_of
 from splatbot.services.schemas import BASE_EXAMPLE, IkRequest, PlanRequest
 from splatbot.services.topics import PLAN
+from splatbot.services.unknown_space import field_with_unknown
 
 router = APIRouter(tags=["motion"])
 
@@ -74,9 +76,10 @@ def plan(request: Request, served: ServedAfterFrames, service: Service, query: _
         else JointGoal(joints_of(robot, query.goal or [], "goal"))
     )
     source = margin_source(served, query.margin)
+    field_at = field_with_unknown(served, query.unknown, robot, base, start)
     found = plan_with_margin(
         source,
-        lambda margin: GaussianRRTStar(served.field, robot, T_world_base=base, margin=margin),
+        lambda margin: GaussianRRTStar(field_at(margin), robot, T_world_base=base, margin=margin),
         lambda planner: planner.plan(start, goal, budget_ms=query.budget_ms, seed=query.seed),
         start,
         goal,
@@ -84,6 +87,7 @@ def plan(request: Request, served: ServedAfterFrames, service: Service, query: _
         speed=query.speed,
     )
     result, trajectory = found.result, found.trajectory
+    refuse_unknown(result, len(served.ready.model), query.unknown)
     result.unwrap()
     assert trajectory is not None
     points = len(trajectory.control) - 2 if query.rate is None else trajectory.duration * query.rate
@@ -95,7 +99,7 @@ def plan(request: Request, served: ServedAfterFrames, service: Service, query: _
             field="rate",
             hint=hint,
         )
-    covers = found.scope(n_sigma=served.field.n_sigma, unknown="free", confidence=query.confidence)
+    covers = found.scope(n_sigma=served.field.n_sigma, unknown=query.unknown, confidence=query.confidence)
     kept = service.plans.add(served, robot.name, base, result, trajectory, source.why, covers)
     service.store.tell(served, PLAN, trajectory)
     return answer(request, _description(kept, query.rate))

@@ -10,7 +10,7 @@ import tyro
 
 from splatbot.cli.paths import check_output
 from splatbot.cli.placing import Pose, base_pose, checked_pose, margin_value, run_folder
-from splatbot.errors import InputError, SplatbotError
+from splatbot.errors import InputError
 from splatbot.layouts import map_file
 
 if TYPE_CHECKING:
@@ -89,6 +89,7 @@ def plan(
     from splatbot.gaussians import GaussianModel
     from splatbot.planning import GaussianRRTStar, PoseGoal
     from splatbot.report.plan_page import plan_html, plan_png
+    from splatbot.results.unknown import refuse_unknown
     from splatbot.robots.appearance import appearance, coarse_appearance
     from splatbot.robots.store import load_robot
 
@@ -120,7 +121,7 @@ def plan(
         speed=speed,
     )
     result, trajectory = found.result, found.trajectory
-    _refuse_unknown(result, len(model), unknown)
+    refuse_unknown(result, len(model), unknown)
     result.unwrap()
     assert trajectory is not None
     covers = found.scope(n_sigma=n_sigma, unknown=unknown, confidence=confidence)
@@ -155,27 +156,6 @@ def _unknown_solids(
     spheres = RobotSpheres(arm, T_world_base=T_world_base)
     space = unknown_in_reach(run, reopen_log(run), spheres)
     return lambda margin: obstacles(space, policy, spheres, here, margin=margin) or None
-
-
-_UNKNOWN_SPACE = {
-    "cautious": "space in which two frames looked and measured no depth",
-    "occupied": "space that no frame saw to be empty",
-}
-
-
-def _refuse_unknown(result: PlanResult, gaussians: int, policy: UnknownPolicy) -> None:
-    """Raise an error if unknown space, which follows the map's Gaussians, makes a start or goal invalid."""
-    from splatbot.planning import PlanStatus
-
-    ends = {PlanStatus.START_STATE_IN_COLLISION: "start", PlanStatus.GOAL_IN_COLLISION: "goal"}
-    cause = result.cause
-    if result.status not in ends or cause is None or cause.gaussian < gaussians:
-        return
-    raise SplatbotError(
-        f"link {cause.link} is {1e3 * cause.depth:.1f} mm deep in {_UNKNOWN_SPACE[policy]}.",
-        field=ends[result.status],
-        hint="map the place from more views, give another goal, or plan with --unknown free",
-    )
 
 
 def _plan(

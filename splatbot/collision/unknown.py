@@ -73,6 +73,27 @@ class UnknownSpace:
         found[inside] = self.unknown[tuple(cell[inside].T)]
         return found
 
+    def without(self, spheres: ArrayLike) -> UnknownSpace:
+        """Return the same space without the voxels whose enclosing spheres meet any of the spheres (S, 4).
+
+        Args:
+            spheres: (S, 4) = (x, y, z, radius) [m, world], which are known to be free or filled by the robot.
+        """
+        unknown, suspect = self.unknown.copy(), self.suspect.copy()
+        for x, y, z, radius in rows(np.asarray(spheres), "spheres", 4, "metres (x, y, z, radius)"):
+            reach = radius + np.sqrt(3) / 2 * self.voxel
+            center = (np.array([x, y, z]) - self.origin) / self.voxel - 0.5  # [voxels]
+            first = np.maximum(np.floor(center - reach / self.voxel), 0).astype(np.int64)
+            last = np.minimum(np.ceil(center + reach / self.voxel) + 1, unknown.shape).astype(np.int64)
+            if (first >= last).any():
+                continue
+            i, j, k = (np.arange(low, high) - at for low, high, at in zip(first, last, center, strict=True))
+            met = i[:, None, None] ** 2 + j[:, None] ** 2 + k**2 < (reach / self.voxel) ** 2
+            part = tuple(slice(low, high) for low, high in zip(first, last, strict=True))
+            unknown[part] &= ~met
+            suspect[part] &= ~met
+        return UnknownSpace(unknown, suspect, self.origin, self.voxel)
+
     def solids(self, n_sigma: float = 2.0, *, rim: bool = True, policy: UnknownPolicy = "occupied") -> GaussianModel:
         """Return spheres that enclose the voxels of a policy, as Gaussians whose surface is at ``n_sigma``.
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike
-from scipy.spatial import cKDTree
 
 from splatbot.collision import RobotSpheres, UnknownSpace, find_unknown
 from splatbot.collision.unknown import UnknownPolicy
+from splatbot.errors import SplatbotError
 from splatbot.gaussians import GaussianModel
 from splatbot.logs import Log
+from splatbot.planning import PlanResult, PlanStatus
 from splatbot.results.folder import RunFolder
 from splatbot.results.views import raw_views
 
@@ -53,9 +53,10 @@ def unknown_in_reach(run: RunFolder, log: Log, arm: RobotSpheres) -> UnknownSpac
 def obstacles(
     space: UnknownSpace, policy: UnknownPolicy, arm: RobotSpheres, occupied: ArrayLike, *, margin: float = 0.0
 ) -> GaussianModel:
-    """Return the solids of unknown space under a policy, without those near the arm where it is known to be.
+    """Return the solids of unknown space under a policy, without the volume of the arm where it is known to be.
 
-    The arm fills space that no camera sees, and is there without a collision.
+    The arm fills space that no camera sees, and is there without a collision. From there it cannot move farther into
+    unknown space: the rest of it is solid around that volume too.
 
     Args:
         space: unknown space.
@@ -65,13 +66,41 @@ def obstacles(
         margin: clearance that a plan keeps [m]. Solids within it of the arm are left out too, because a plan could not
             start there.
     """
-    solids = space.solids(policy=policy)
-    if not len(solids):
-        return solids
     q = np.atleast_2d(np.asarray(occupied, dtype=np.float64))
     centers, radii = arm.centers(q).reshape(-1, 3), np.tile(arm.spheres.radii + margin, len(q))
-    means, size = solids.means.double().numpy(), np.sqrt(3) / 2 * space.voxel
-    touched = np.zeros(len(means), np.bool_)
-    for rows in cKDTree(means).query_ball_point(centers, radii + size):
-        touched[rows] = True
-    return solids.select(torch.from_numpy(np.flatnonzero(~touched)))
+    return space.without(np.c_[centers, radii]).solids(policy=policy)
+
+
+_MEANINGS = {
+    "cautious": "space in which two frames looked and measured no depth",
+    "occupied": "space that no frame saw to be empty",
+}
+
+
+def refuse_unknown(result: PlanResult, gaussians: int, policy: UnknownPolicy) -> None:
+    """Check that unknown space makes neither start nor goal of a plan invalid.
+
+    Args:
+        result: of a plan on the map and the solids of unknown space, in this order.
+        gaussians: number of Gaussians of the map.
+        policy: treatment of unknown space.
+
+    Raises:
+        SplatbotError: it does; the message names the link and the kind of space.
+    """
+    ends = {PlanStatus.START_STATE_IN_COLLISION: "start", PlanStatus.GOAL_IN_COLLISION: "goal"}
+    cause = result.cause
+    if result.status not in ends or cause is None or cause.gaussian < gaussians:
+        return
+    named = f" (after {cause.name})" if cause.name else ""
+    raise UnknownSpaceError(
+        f"link {cause.link}{named} is {1e3 * cause.depth:.1f} mm deep in {_MEANINGS[policy]}.",
+        field=ends[result.status],
+        hint="map the place from more views, give another goal, or let unknown space be free",
+    )
+
+
+class UnknownSpaceError(SplatbotError):
+    """The start or the goal of a plan is in unknown space."""
+
+    http_status = 422

@@ -80,6 +80,20 @@ def test_a_given_margin_is_kept_and_stated(service: Service) -> None:
     assert (zero["margin_m"], zero["margin_source"]) == (0.0, "given")
 
 
+def test_unknown_space_is_an_obstacle_where_it_is_asked_for(service: Service) -> None:
+    blocked = plan(service, "table", unknown="occupied", margin=0)  # no frame saw the place of the arm
+    assert blocked.status_code == 422
+    assert "space that no frame saw to be empty" in blocked.json()["detail"]
+    assert "panda_joint" in blocked.json()["detail"]
+    wary = plan(service, "table", unknown="cautious", margin=0).json()
+    assert wary["covers"]["unknown_space"] == "cautious"
+    assert plan(service, "table", margin=0).json()["covers"]["unknown_space"] == "free"
+    refused = plan(service, "wall", unknown="cautious")
+    assert refused.status_code == 422
+    assert refused.json()["field"] == "unknown"
+    assert plan(service, "table", unknown="maybe").status_code == 422
+
+
 def test_without_a_recording_the_answer_says_that_the_error_is_unknown(service: Service) -> None:
     answer = plan(service, "wall").json()
     assert answer["margin_m"] == 0.0

@@ -73,9 +73,9 @@ def test_a_base_that_stands_in_the_map_is_reported(run: RunCommand, map_file: Pa
 
 
 def test_unknown_space_at_the_start_is_named_instead_of_a_gaussian() -> None:
-    from splatbot.cli.plan import _refuse_unknown
     from splatbot.gaussians import GaussianModel
     from splatbot.planning import GaussianRRTStar
+    from splatbot.results.unknown import refuse_unknown
 
     model = tabletop().gaussians(2000)
     at = RobotSpheres(panda()).centers(panda().home[None])[0, 100:102]
@@ -85,10 +85,10 @@ def test_unknown_space_at_the_start_is_named_instead_of_a_gaussian() -> None:
     field = GaussianCollisionField(GaussianModel.concatenate([model, unknown]))
     result = GaussianRRTStar(field, panda()).plan(panda().home, panda().home, budget_ms=10)
     with pytest.raises(SplatbotError, match="no frame saw to be empty"):
-        _refuse_unknown(result, len(model), "occupied")
+        refuse_unknown(result, len(model), "occupied")
     with pytest.raises(SplatbotError, match="two frames looked and measured no depth"):
-        _refuse_unknown(result, len(model), "cautious")
-    _refuse_unknown(result, len(model) + 2, "occupied")  # a Gaussian of the map is named by the planner
+        refuse_unknown(result, len(model), "cautious")
+    refuse_unknown(result, len(model) + 2, "occupied")  # a Gaussian of the map is named by the planner
 
 
 def test_the_base_is_taken_from_the_scene_file_of_the_map_and_a_pose_is_reached(
