@@ -34,7 +34,7 @@ class Request(BaseModel):
         return self
 
 
-BASE_EXAMPLE = {"translation": [0.0, 0.5, 0.0], "quat_wxyz": [0.7071068, 0.7071068, 0.0, 0.0]}
+BASE_EXAMPLE = {"translation": [0.0, 0.5, 0.0], "quaternion_wxyz": [0.7071068, 0.7071068, 0.0, 0.0]}
 """A robot's base in a map whose world is a level camera: z up, below it."""
 
 
@@ -42,7 +42,7 @@ class Pose(Request):
     """A rigid transform."""
 
     translation: Vector3 = Field((0.0, 0.0, 0.0), description="[m]")
-    quat_wxyz: Vector4 = Field((1.0, 0.0, 0.0, 0.0), description="rotation")
+    quaternion_wxyz: Vector4 = Field((1.0, 0.0, 0.0, 0.0), description="rotation")
 
     def matrix(self, field: str) -> NDArray[np.float64]:
         """Return the pose (4, 4).
@@ -51,9 +51,9 @@ class Pose(Request):
             InputError: a number is not finite, or the quaternion is zero.
         """
         try:
-            return pose_from_quat(self.translation, self.quat_wxyz)
+            return pose_from_quat(self.translation, self.quaternion_wxyz)
         except ValueError as error:
-            raise InputError(f"{error}.", field=field, hint="no rotation is quat_wxyz (1, 0, 0, 0)") from error
+            raise InputError(f"{error}.", field=field, hint="no rotation is quaternion_wxyz (1, 0, 0, 0)") from error
 
 
 class HealthResponse(BaseModel):
@@ -129,15 +129,15 @@ class RenderRequest(Request):
     camera: CameraIn | None = Field(None, description="default: 640x480 pixels, 60 degrees wide")
     T_world_camera: tuple[Vector4, Vector4, Vector4, Vector4] | None = Field(None, description="(4, 4), row by row")
     translation: Vector3 | None = Field(None, description="camera centre, world frame [m]")
-    quat_wxyz: Vector4 | None = Field(None, description="rotation of T_world_camera")
+    quaternion_wxyz: Vector4 | None = Field(None, description="rotation of T_world_camera")
     depth_range_m: tuple[float, float] | None = Field(None, description="colours of mode depth; default: 2..98 %")
 
     @model_validator(mode="after")
     def _one_pose(self) -> Self:
-        if (self.translation is None) != (self.quat_wxyz is None):
-            raise ValueError("give translation and quat_wxyz together")
+        if (self.translation is None) != (self.quaternion_wxyz is None):
+            raise ValueError("give translation and quaternion_wxyz together")
         if self.T_world_camera is not None and self.translation is not None:
-            raise ValueError("give either T_world_camera or translation and quat_wxyz")
+            raise ValueError("give either T_world_camera or translation and quaternion_wxyz")
         return self
 
 

@@ -25,7 +25,7 @@ from splatbot.services.topics import GRASPS
 
 router = APIRouter(prefix="/v1/maps", tags=["grasping"])
 
-_BASE = {"translation": [0.0, 0.0, 0.0], "quat_wxyz": [1.0, 0.0, 0.0, 0.0]}
+_BASE = {"translation": [0.0, 0.0, 0.0], "quaternion_wxyz": [1.0, 0.0, 0.0, 0.0]}
 _EXAMPLES = {
     "by its name": {"target": "largest box", "base": _BASE},
     "by a point, the hand alone": {"point": [0.5, 0.0, 0.08], "base": _BASE, "hand_only": True, "samples": 100},

@@ -57,7 +57,7 @@ _CREATE = {
     "a synthetic log": {"id": "tabletop", "log": "synthetic:tabletop?frames=8&width=160&height=120"},
     "frames that will be pushed": {
         "id": "robot",
-        "robot_base": {"translation": [0.0, 0.5, 0.0], "quat_wxyz": [1.0, 0.0, 0.0, 0.0]},
+        "robot_base": {"translation": [0.0, 0.5, 0.0], "quaternion_wxyz": [1.0, 0.0, 0.0, 0.0]},
     },
 }
 _FILE: dict[int | str, dict[str, Any]] = {200: {"content": {"application/octet-stream": {}}, "description": "the file"}}

@@ -24,7 +24,7 @@ from splatbot.services.unknown_space import field_with_unknown
 
 router = APIRouter(tags=["motion"])
 
-_DOWN = {"translation": [0.4, 0.2, 0.4], "quat_wxyz": [0.0, 1.0, 0.0, 0.0]}
+_DOWN = {"translation": [0.4, 0.2, 0.4], "quaternion_wxyz": [0.0, 1.0, 0.0, 0.0]}
 _EXAMPLES = {
     "to joints": {"goal": [0.3, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785], "base": BASE_EXAMPLE},
     "the tool to a pose": {"goal_pose": _DOWN, "base": BASE_EXAMPLE, "budget_ms": 300},

@@ -36,7 +36,7 @@ _EXAMPLES: dict[str, Any] = {
         "mode": "depth",
         "camera": {"fx": 525, "fy": 525, "cx": 319.5, "cy": 239.5, "width": 640, "height": 480},
         "translation": [0.0, 0.0, -0.2],
-        "quat_wxyz": [1.0, 0.0, 0.0, 0.0],
+        "quaternion_wxyz": [1.0, 0.0, 0.0, 0.0],
         "depth_range_m": [0.3, 2.0],
     },
 }
@@ -80,8 +80,8 @@ def render(served: ServedAfterFrames, settings: Settings, request: _Body) -> Res
         camera, pose = default_view(model)
     if request.T_world_camera is not None:
         pose = np.asarray(request.T_world_camera, dtype=np.float64)
-    elif request.translation is not None and request.quat_wxyz is not None:
-        pose = Pose(translation=request.translation, quat_wxyz=request.quat_wxyz).matrix("quat_wxyz")
+    elif request.translation is not None and request.quaternion_wxyz is not None:
+        pose = Pose(translation=request.translation, quaternion_wxyz=request.quaternion_wxyz).matrix("quaternion_wxyz")
     tag = etag(served, request.model_dump_json())
     return _png(served, tag, camera, pose, request.mode, request.depth_range_m)
 

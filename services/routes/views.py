@@ -25,7 +25,7 @@ _EXAMPLES = {
         "modes": ["rgb", "depth"],
         "views": [
             {"camera": _CAMERA, "pose": {"translation": [0.0, 0.0, -0.2]}},
-            {"camera": _CAMERA, "pose": {"translation": [0.1, 0.0, -0.2], "quat_wxyz": [1.0, 0.0, 0.0, 0.0]}},
+            {"camera": _CAMERA, "pose": {"translation": [0.1, 0.0, -0.2], "quaternion_wxyz": [1.0, 0.0, 0.0, 0.0]}},
         ],
     }
 }

@@ -134,16 +134,13 @@ def grasp(
     hint = _hint(map, index, target=target, pixel=pixel, point=point, box=box, mask=mask, tag=tag)
     found = find_target(hint, scene, [*name_backends(vlm=vlm), SpatialAffordance(), TagAffordance()])
     sampler = objects.sampler(arm, hand_only=hand_only, n_sigma=n_sigma, min_observations=min_observations)
-    auto = margin == "auto" or (margin is None and sampler.raw is not None)
-    if auto:
-        sampler.arm_margin = _audited(map, sampler, found)
-    else:
-        sampler.margin = margin_value(margin or "0")
+    margin_text = _set_margin(sampler, margin, map, found)
     result = objects.with_notes(sampler.sample(found, options))
     folder = out if out is not None else Path("runs") / "grasp"
     folder.mkdir(parents=True, exist_ok=True)
     with atomic_write(folder / "grasp.json") as handle:
-        handle.write(json.dumps(summary(result), indent=2).encode())
+        margins = {"margin_m": sampler.margin, "arm_margin_m": max(sampler.margin, sampler.arm_margin)}
+        handle.write(json.dumps(summary(result) | margins, indent=2).encode())
     shown = next(iter((*result.grasps, *result.doubtful)), result.best_rejected)
     if shown is not None:
         with atomic_write(folder / "grasp.png") as handle:
@@ -154,7 +151,7 @@ def grasp(
         why = " ".join(note for note in found.notes if note.startswith("took "))
         raise SplatbotError(f"cannot be grasped: {reason}. {why}".strip(), field=found.label, hint=change)
     result.unwrap()
-    _print(result, folder, _margin_text(sampler, auto=auto), verbose=verbose)
+    _print(result, folder, margin_text, verbose=verbose)
     return 0
 
 
@@ -244,10 +241,22 @@ def _audited(map_: Path, sampler: GraspSampler, target: Target) -> float:
     return error.in_region(means[target.rows]).quantile(CONSTANTS.confidence)
 
 
-def _margin_text(sampler: GraspSampler, *, auto: bool) -> str:
+def _set_margin(sampler: GraspSampler, margin: str | None, map_: Path, target: Target) -> str:
+    """Set the margin of a search, and return what it covers.
+
+    Raises:
+        SplatbotError: the margin is "auto", and the map has no recording that can be read.
+    """
     hand = "the hand clears measured depth" if sampler.raw is not None else "no run with depth checks the hand"
-    if auto:
+    if margin == "auto" or (margin is None and map_.is_dir()):
+        try:
+            sampler.arm_margin = _audited(map_, sampler, target)
+        except SplatbotError as error:
+            if margin == "auto":
+                raise
+            return f"0, because the recording cannot be audited ({error.message}); {hand}"
         return f"arm {1e3 * sampler.arm_margin:.1f} mm, the error of the map around the target; {hand}"
+    sampler.margin = margin_value(margin or "0")
     if sampler.margin > 0.0:
         return f"{1e3 * sampler.margin:.1f} mm for arm and hand; {hand}"
     return f"0, so that errors of the map are not covered; {hand}"

@@ -27,7 +27,7 @@ from splatbot.serving import Serving, serving
 FRAME_S = 0.03  # time between frames [s]
 LOG = "synthetic:tabletop?frames=60&width=160&height=120"
 MAP = "default"
-BASE = {"translation": [0.0, 0.5, 0.0], "quat_wxyz": [1.0, 0.0, 0.0, 0.0]}
+BASE = {"translation": [0.0, 0.5, 0.0], "quaternion_wxyz": [1.0, 0.0, 0.0, 0.0]}
 GOAL = [0.3, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785]
 
 
@@ -66,7 +66,9 @@ def requests(http: httpx.Client) -> dict[str, Any]:
         "view": lambda: http.get(f"{under}/render", params={"width": 160, "height": 120}),
         "maps": lambda: http.get("/v1/maps"),
         "healthz": lambda: http.get("/healthz"),
-        "IK": lambda: http.post("/v1/ik", json={"pose": {"translation": [0.4, 0.2, 0.4], "quat_wxyz": [0, 1, 0, 0]}}),
+        "IK": lambda: http.post(
+            "/v1/ik", json={"pose": {"translation": [0.4, 0.2, 0.4], "quaternion_wxyz": [0, 1, 0, 0]}}
+        ),
         "plan": lambda: http.post(f"{under}/plans", json={"goal": GOAL, "base": BASE, "budget_ms": 20}),
     }
 

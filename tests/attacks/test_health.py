@@ -263,7 +263,7 @@ def test_idle_sockets_beyond_the_files_of_the_process_do_not_make_it_deaf(proces
 @pytest.mark.long
 def test_health_is_quick_while_50_plans_are_asked_for(process: tuple[str, Path]) -> None:
     url, _ = process
-    base = {"translation": [0.0, 0.5, -1.0], "quat_wxyz": [0.7071068, 0.7071068, 0.0, 0.0]}
+    base = {"translation": [0.0, 0.5, -1.0], "quaternion_wxyz": [0.7071068, 0.7071068, 0.0, 0.0]}
     body = {"goal": [0.3, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785], "base": base, "budget_ms": 1000}
     seconds: list[float] = []
     with ThreadPoolExecutor(50) as clients, httpx.Client(base_url=url, timeout=60) as planner, Probe(url) as probe:

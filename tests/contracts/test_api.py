@@ -28,7 +28,7 @@ from splatbot.workspace import Workspace
 from tests.contracts.conftest import Service, running, table_with_box, wall
 
 LOG = "synthetic:tabletop?frames=6&width=160&height=120&arc=4"
-BASE = {"translation": [0.0, 0.5, 0.0], "quat_wxyz": [0.7071068, 0.7071068, 0.0, 0.0]}
+BASE = {"translation": [0.0, 0.5, 0.0], "quaternion_wxyz": [0.7071068, 0.7071068, 0.0, 0.0]}
 HOME = [0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785]
 
 
@@ -38,7 +38,7 @@ def api() -> Iterator[Service]:
     path = Trajectory(np.arange(2.0), np.tile(np.eye(4), (2, 1, 1)))
     store.add("default", source="wall.ply", state="static", snapshot=wall(), trajectory=path)
     store.add("table", source="a table", state="static", snapshot=table_with_box())
-    beside = Workspace(T_world_base=pose_from_quat(BASE["translation"], BASE["quat_wxyz"]))
+    beside = Workspace(T_world_base=pose_from_quat(BASE["translation"], BASE["quaternion_wxyz"]))
     store.add("lab", source="wall.ply", state="static", snapshot=wall(), workspace=beside)
     with running(ServiceSettings(), store) as service:
         yield service
@@ -176,7 +176,7 @@ def test_a_motion_that_is_stopped_is_cancelled_and_the_arm_stands_still(api: Ser
 
 
 def test_a_plan_into_the_wall_is_a_problem_with_moveit_s_code(robot: Client) -> None:
-    far = {"translation": [0.0, 3.0, 0.0], "quat_wxyz": [1.0, 0.0, 0.0, 0.0]}
+    far = {"translation": [0.0, 3.0, 0.0], "quaternion_wxyz": [1.0, 0.0, 0.0, 0.0]}
     with pytest.raises(ServiceError) as caught:
         robot.plan("default", goal_pose=far, base=BASE)
     assert (caught.value.status, caught.value.code) == (422, -31)
@@ -195,7 +195,7 @@ def test_grasps_of_a_box_are_as_wide_as_it_is_and_one_that_is_not_there_is_a_pro
 
 
 def test_ik_reaches_the_pose(robot: Client) -> None:
-    pose = {"translation": [0.4, 0.2, 0.4], "quat_wxyz": [0.0, 1.0, 0.0, 0.0]}
+    pose = {"translation": [0.4, 0.2, 0.4], "quaternion_wxyz": [0.0, 1.0, 0.0, 0.0]}
     for q in robot.ik(pose):
         np.testing.assert_allclose(panda().tcp(q)[:3, 3], [0.4, 0.2, 0.4], atol=1e-5)
 

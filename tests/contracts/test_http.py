@@ -163,7 +163,7 @@ def test_a_pose_as_quaternion_draws_what_the_same_pose_as_matrix_draws(service: 
     half = np.sqrt(0.5)
     matrix = [[0, 0, 1, -0.5], [0, 1, 0, 0], [-1, 0, 0, 1.2], [0, 0, 0, 1]]  # a quarter turn about y
     by_matrix = {"camera": CAMERA, "T_world_camera": matrix}
-    by_quat = {"camera": CAMERA, "translation": [-0.5, 0, 1.2], "quat_wxyz": [half, 0, half, 0]}
+    by_quat = {"camera": CAMERA, "translation": [-0.5, 0, 1.2], "quaternion_wxyz": [half, 0, half, 0]}
     images = [_image(service.client.post("/v1/maps/wall/render", json=body)) for body in (by_matrix, by_quat)]
     assert images[0].any()
     assert int((np.abs(images[0].astype(int) - images[1].astype(int)) > 1).sum()) == 0
@@ -184,9 +184,9 @@ def test_a_picture_is_sent_again_only_after_the_map_has_changed(service: Service
     [
         ({"T_world_camera": (np.eye(4) * 2).tolist()}, "T_world_camera"),
         ({"T_world_camera": np.eye(3).tolist()}, "T_world_camera"),
-        ({"translation": [0, 0, 0]}, "quat_wxyz"),
-        ({"translation": [0, 0, 0], "quat_wxyz": [0, 0, 0, 0]}, "quat_wxyz"),
-        ({"translation": [0, 0, 0], "quat_wxyz": [1, 0, 0, 0], "T_world_camera": np.eye(4).tolist()}, "either"),
+        ({"translation": [0, 0, 0]}, "quaternion_wxyz"),
+        ({"translation": [0, 0, 0], "quaternion_wxyz": [0, 0, 0, 0]}, "quaternion_wxyz"),
+        ({"translation": [0, 0, 0], "quaternion_wxyz": [1, 0, 0, 0], "T_world_camera": np.eye(4).tolist()}, "either"),
         ({"camera": CAMERA | {"fx": -1}}, "fx"),
         ({"camera": CAMERA | {"width": 0}}, "width"),
         ({"camera": {"fx": 200}}, "camera"),

@@ -24,8 +24,8 @@ from tests.contracts.conftest import Service, running, wall
 
 HOME = panda().home.tolist()
 GOAL = [0.3, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785]
-BASE = {"translation": [0.0, 0.9, 0.3], "quat_wxyz": [1.0, 0.0, 0.0, 0.0]}
-FAR = {"translation": [0.0, 30.0, 0.0], "quat_wxyz": [1.0, 0.0, 0.0, 0.0]}
+BASE = {"translation": [0.0, 0.9, 0.3], "quaternion_wxyz": [1.0, 0.0, 0.0, 0.0]}
+FAR = {"translation": [0.0, 30.0, 0.0], "quaternion_wxyz": [1.0, 0.0, 0.0, 0.0]}
 
 
 @pytest.fixture(scope="module")

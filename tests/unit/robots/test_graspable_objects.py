@@ -111,7 +111,7 @@ def test_the_service_says_which_evidence_it_lacks(run_folder: Path) -> None:
     assert "no run's folder" in note
 
 
-_HERE = {"translation": [0.0, 0.0, 0.0], "quat_wxyz": [1.0, 0.0, 0.0, 0.0]}
+_HERE = {"translation": [0.0, 0.0, 0.0], "quaternion_wxyz": [1.0, 0.0, 0.0, 0.0]}
 
 
 def test_a_map_is_measured_once_for_all_questions(run_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
