@@ -242,7 +242,7 @@ def _audited(map_: Path, sampler: GraspSampler, target: Target) -> float:
 
 
 def _set_margin(sampler: GraspSampler, margin: str | None, map_: Path, target: Target) -> str:
-    """Set the margin of a search, and return what it covers.
+    """Set the margin of a search, and describe its scope.
 
     Raises:
         SplatbotError: the margin is "auto", and the map has no recording that can be read.

@@ -57,6 +57,8 @@ def first_change(result: GraspResult, scene: SegmentedMap, stroke: float) -> tup
     if result.doubtful:
         best = result.doubtful[0]
         why = f"{len(result.doubtful)} grasps fit the map, but the best of them {best.rejected}"
+        if best.rejected.endswith("the hand opens"):
+            return why, "take a hand that opens wider (`splatbot robot list`), or map it again from more sides"
         if best.rejected.startswith("has a confidence"):
             return why, "take another hand, or allow such grasps (--min-confidence)"
         return why, "map it again from more sides, or allow such grasps (--accept-implied)"

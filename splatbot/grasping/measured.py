@@ -26,6 +26,8 @@ class MeasuredDepthConstants:
         contact_distance: [m] largest distance of a measured contact from the nearest confirmed point.
         unseen_from: [m] distance of a contact from depth above which its finger must be in space that was seen.
         max_unseen: largest unseen share of the inner face of such a finger.
+        implied_gap: [m] free space that a pad needs at an implied contact, at the widest opening. Implied sides are
+            wrong by millimetres, and a face that is seen to be free is known no better than depth.
         seen_sigmas: standard deviations of depth by which a ray must end behind a point to show that it is free.
         face_grid: points of a finger's inner face across and along its approach.
         spacing: [m] edge of the voxels in which each frame proposes one point.
@@ -40,6 +42,7 @@ class MeasuredDepthConstants:
     contact_distance: float = 0.003
     unseen_from: float = 0.006
     max_unseen: float = 0.1
+    implied_gap: float = 0.006
     seen_sigmas: float = 3.0
     face_grid: tuple[int, int] = (7, 15)
     spacing: float = 0.003

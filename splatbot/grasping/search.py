@@ -303,8 +303,13 @@ class Search:
             self.log.best = self._grasp(scored, k, rejected=reason)
         kept = scored.select(free)
         assert self.s.raw is not None
-        unsafe = blind(away[free], self.s.raw.unseen(kept.hands, self.s.hand)).any(axis=1)
-        return kept.select(np.lexsort((-kept.totals, unsafe | (kept.terms["measured"] == 0.0))))
+        hidden = blind(away[free], self.s.raw.unseen(kept.hands, self.s.hand)).any(axis=1)
+        tight = self._tight(self.pairs.width[kept.hands.pair]) & (kept.terms["measured"] < 1.0)
+        return kept.select(np.lexsort((-kept.totals, hidden | tight | (kept.terms["measured"] == 0.0))))
+
+    def _tight(self, width: Array) -> NDArray[np.bool_]:
+        """Return whether widths (K,) [m] leave the pads less free space than implied contacts need."""
+        return np.asarray(self.s.hand.stroke - width < 2 * MEASURED.implied_gap)
 
     def _reached(
         self, scored: _Scored, reach: ReachabilityCheck | None, avoid_moving: ReachabilityCheck | None
@@ -450,6 +455,9 @@ class Search:
         if all(grasp.implied):
             away = " and ".join(f"{1e3 * value:.0f}" for value in grasp.depth_distance)
             return f"has no contact at measured depth, which is {away} mm away"
+        if any(grasp.implied) and self._tight(np.array([grasp.width]))[0]:
+            width, most = 1e3 * grasp.width, 1e3 * self.s.hand.stroke
+            return f"is {width:.0f} mm wide at an implied contact, too close to the {most:.0f} mm that the hand opens"
         for hidden, away, unseen in zip(grasp.blind, grasp.depth_distance, grasp.unseen, strict=True):
             if hidden:
                 why = f"{unseen:.0%} of its face is in unseen space"

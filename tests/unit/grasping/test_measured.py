@@ -241,6 +241,24 @@ def test_a_finger_that_enters_unseen_space_is_not_offered() -> None:
     assert not every.doubtful
 
 
+def test_an_implied_side_needs_more_free_space_at_the_pad(monkeypatch: pytest.MonkeyPatch) -> None:
+    from splatbot.grasping import search
+
+    half, target = raw(TABLE, *OBJECTS.values(), turns=np.linspace(-1.2, 0.0, 8)), target_of(scene(), BOX, "box")
+    assert HAND is not None
+    gap = 0.5 * (HAND.stroke - BOX.size[1]) + 0.002  # more than the box leaves
+    monkeypatch.setattr(search, "MEASURED", replace(CONSTANTS, implied_gap=gap))
+    result = GraspSampler(scene(), panda(), raw=half, hand_only=True).sample(target)
+    assert not any(any(g.implied) and g.width > HAND.stroke - 2 * gap for g in result.grasps)
+    assert result.doubtful
+    assert "wide at an implied contact, too close to the 80 mm that the hand opens" in result.doubtful[0].rejected
+    if not result.grasps:
+        assert "opens wider" in first_change(result, scene(), HAND.stroke)[1]
+    every = GraspSampler(scene(), panda(), raw=everything(), hand_only=True).sample(target)
+    assert every.grasps  # its sides are measured
+    assert not any("implied contact" in g.rejected for g in every.doubtful)
+
+
 def test_results_state_the_support_of_each_contact_and_null_where_it_was_not_checked() -> None:
     known = summary(grasps_with(everything()))["grasps"][0]
     assert known["contact_implied"] == [False, False]
