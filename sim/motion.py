@@ -207,10 +207,11 @@ def load_motion(path: str | Path, robot: RobotModel) -> JointMotion:
         raise FormatError(f"cannot be read ({error.strerror}).", file=file, hint="check the path") from error
     except (KeyError, TypeError, ValueError, IndexError) as error:
         raise FormatError(
-            f"is no trajectory of {robot.name}: {error!r}.",
+            f"is no trajectory of {robot.name} ({error}).",
             file=file,
             field="trajectory",
-            hint=f"write JointTrajectory JSON, or CSV with time and position.{robot.chain.names[0]} and so on",
+            hint=f"plan with {robot.name}, or write JointTrajectory JSON or CSV with time and "
+            f"position.{robot.chain.names[0]} and so on",
         ) from error
     try:
         return motion_from_samples(*values)
@@ -220,6 +221,9 @@ def load_motion(path: str | Path, robot: RobotModel) -> JointMotion:
 
 def _from_json(text: str, robot: RobotModel) -> tuple[Array, Array, Array | None]:
     values: Mapping[str, Any] = json.loads(text)
+    missing = [name for name in robot.chain.names if name not in values["joint_names"]]
+    if missing:
+        raise ValueError(f"it moves {', '.join(values['joint_names'])}, not {missing[0]}")
     order = [values["joint_names"].index(name) for name in robot.chain.names]
     points = values["points"]
     stamps = [p["time_from_start"]["sec"] + 1e-9 * p["time_from_start"]["nanosec"] for p in points]

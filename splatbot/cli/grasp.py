@@ -107,6 +107,7 @@ def grasp(
 
     from splatbot.atomic import atomic_write
     from splatbot.cli.affordances import name_backends
+    from splatbot.cli.tables import print_text
     from splatbot.grasping.advice import first_change
     from splatbot.grasping.affordance import find_target
     from splatbot.grasping.object_list import stroke_of
@@ -139,7 +140,11 @@ def grasp(
     folder = out if out is not None else Path("runs") / "grasp"
     folder.mkdir(parents=True, exist_ok=True)
     with atomic_write(folder / "grasp.json") as handle:
-        margins = {"margin_m": sampler.margin, "arm_margin_m": max(sampler.margin, sampler.arm_margin)}
+        margins = {
+            "robot": arm.name,
+            "margin_m": sampler.margin,
+            "arm_margin_m": max(sampler.margin, sampler.arm_margin),
+        }
         handle.write(json.dumps(summary(result) | margins, indent=2).encode())
     shown = next(iter((*result.grasps, *result.doubtful)), result.best_rejected)
     if shown is not None:
@@ -152,6 +157,8 @@ def grasp(
         raise SplatbotError(f"cannot be grasped: {reason}. {why}".strip(), field=found.label, hint=change)
     result.unwrap()
     _print(result, folder, margin_text, verbose=verbose)
+    if not hand_only:
+        print_text(f"next: splatbot plan --map {map} --robot {robot} --start home --grasp {folder / 'grasp.json'}")
     return 0
 
 

