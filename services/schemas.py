@@ -199,7 +199,7 @@ class PlanRequest(Request):
     unknown: Literal["free", "cautious", "occupied"] = Field(
         "free",
         description='space that no frame observed: "occupied" is all of it, "cautious" where two frames looked and '
-        "measured no depth. Needs a recording, and seconds for the first plan of a robot and base",
+        "measured no depth. Needs a recording, the base of the map, and seconds for the first plan of a robot",
     )
     budget_ms: Annotated[float, Field(gt=0, allow_inf_nan=False)] = Field(100.0, description="time to plan")
     seed: Annotated[int, Field(ge=0, lt=2**32)] = Field(0, description="seed of the search")

@@ -26,13 +26,13 @@ def field_with_unknown(
 ) -> Callable[[float], GaussianCollisionField]:
     """Return a function of the margin [m] that gives the field of a map with its unknown space under a policy.
 
-    The search for unknown space takes seconds, once for each map version, robot and base.
+    The search for unknown space takes seconds, once for each map version and robot.
 
     Args:
         served: the map.
         policy: treatment of unknown space.
         robot: the arm.
-        T_world_base: (4, 4) pose of its base.
+        T_world_base: (4, 4) pose of the map's base. Bases of requests would make each request a search.
         start: (J,) configuration at which the arm is [rad or m]; the space that it fills is no obstacle.
 
     Raises:
@@ -49,8 +49,7 @@ def field_with_unknown(
             hint='give "free", or map a recording',
         )
     arm = RobotSpheres(robot, T_world_base=T_world_base)
-    key = ("unknown space", robot.name, T_world_base.tobytes())
-    space = served.derived.get(key, lambda: unknown_in_reach(run, reopen_log(run), arm))
+    space = served.derived.get(("unknown space", robot.name), lambda: unknown_in_reach(run, reopen_log(run), arm))
     model = served.ready.model
 
     def around(margin: float) -> GaussianCollisionField:

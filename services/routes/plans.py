@@ -7,6 +7,7 @@ from typing import Annotated, Any
 import numpy as np
 from fastapi import APIRouter, Depends, Path, Request, Response
 
+from splatbot.errors import InputError
 from splatbot.geometry import inverse
 from splatbot.planning import GaussianRRTStar, JointGoal, PoseGoal
 from splatbot.planning.ik import solve_ik
@@ -75,6 +76,9 @@ def plan(request: Request, served: ServedAfterFrames, service: Service, query: _
         if query.goal_pose is not None
         else JointGoal(joints_of(robot, query.goal or [], "goal"))
     )
+    if query.unknown != "free" and query.base is not None:
+        hint = "write the base into the scene.yaml of the map, or leave unknown space free"
+        raise InputError("is given, but unknown space is known for the base of the map.", field="base", hint=hint)
     source = margin_source(served, query.margin)
     field_at = field_with_unknown(served, query.unknown, robot, base, start)
     found = plan_with_margin(

@@ -20,6 +20,7 @@ from splatbot.robots.panda import panda
 from splatbot.services.margins import margin_source
 from splatbot.services.settings import ServiceSettings
 from splatbot.services.store import MapStore
+from splatbot.workspace import Workspace
 from tests.contracts.conftest import Service, running, wall
 
 HOME = panda().home.tolist()
@@ -44,8 +45,11 @@ def service(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterato
     store = MapStore()
     state = Snapshot(GaussianModel.load(recorded / "map.ply"), 1)
     store.add("table", source="table", state="static", snapshot=state, run=RunFolder(recorded))
+    far = Workspace(T_world_base=np.array([[1.0, 0, 0, 0], [0, 1, 0, 30], [0, 0, 1, 0], [0, 0, 0, 1]]))
+    store.add("placed", source="table", state="static", snapshot=state, run=RunFolder(recorded), workspace=far)
     store.add("lost", source="lost", state="static", snapshot=state, run=RunFolder(lost))
     store.add("wall", source="wall.ply", state="static", snapshot=wall())
+    store.add("bare", source="wall.ply", state="static", snapshot=wall(), workspace=far)
     for file in lost.glob("*.json*"):
         file.unlink()
     with running(ServiceSettings(), store) as one:
@@ -81,16 +85,18 @@ def test_a_given_margin_is_kept_and_stated(service: Service) -> None:
 
 
 def test_unknown_space_is_an_obstacle_where_it_is_asked_for(service: Service) -> None:
-    blocked = plan(service, "table", unknown="occupied", margin=0)  # no frame saw the place of the arm
+    blocked = plan(service, "placed", unknown="occupied", margin=0, base=None)  # no frame saw the place of the arm
     assert blocked.status_code == 422
     assert "space that no frame saw to be empty" in blocked.json()["detail"]
     assert "panda_joint" in blocked.json()["detail"]
-    wary = plan(service, "table", unknown="cautious", margin=0).json()
+    wary = plan(service, "placed", unknown="cautious", margin=0, base=None).json()
     assert wary["covers"]["unknown_space"] == "cautious"
-    assert plan(service, "table", margin=0).json()["covers"]["unknown_space"] == "free"
-    refused = plan(service, "wall", unknown="cautious")
-    assert refused.status_code == 422
-    assert refused.json()["field"] == "unknown"
+    assert plan(service, "placed", margin=0).json()["covers"]["unknown_space"] == "free"
+    refused = plan(service, "bare", unknown="cautious", base=None)
+    assert (refused.status_code, refused.json()["field"]) == (422, "unknown")
+    assert "has no recording" in refused.json()["detail"]
+    elsewhere = plan(service, "placed", unknown="cautious")  # each base would be another search
+    assert (elsewhere.status_code, elsewhere.json()["field"]) == (422, "base")
     assert plan(service, "table", unknown="maybe").status_code == 422
 
 
