@@ -284,7 +284,12 @@ def _print(result: PlanResult, trajectory: JointTrajectory, covers: dict[str, An
         ("clearance", clearance_text(c)),
         ("covers", f"moving links against the map at {covers['n_sigma']:g} sigma and against the arm itself"),
         ("base", _BASE_IN_MAP if covers["base_in_map"] else "not covered: the mounted link is not checked"),
-        ("hand", "covered" if covers["hand"] else "not covered: this robot has none; see `splatbot robot list`"),
+        (
+            "hand",
+            "covered, with the gripper fully open"
+            if covers["hand"]
+            else "not covered: this robot has none; see `splatbot robot list`",
+        ),
         ("unknown space", _UNKNOWN[covers["unknown_space"]]),
         ("margin", _margin_text(covers)),
         ("written to", str(folder)),
