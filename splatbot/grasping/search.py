@@ -480,10 +480,10 @@ class Search:
         if completed > 0.05:
             notes.append(f"{completed:.0%} of its surface was not observed and is completed.")
         if np.isfinite(self.found.narrowest) and not grasps:
-            narrowest, opens = 1e3 * self.found.narrowest, 1e3 * usable_opening(self.s.hand.stroke)
+            narrowest, opens, gap = self.found.narrowest, self.s.hand.stroke, HANDS.min_pad_gap
             notes.append(
-                f"The narrowest of its sides that are too wide are {narrowest:.0f} mm apart, and the hand encloses "
-                f"up to {opens:.0f} mm."
+                f"The narrowest of its sides that are too wide are {1e3 * narrowest:.0f} mm apart, and the hand opens "
+                f"{1e3 * opens:.0f} mm, with {1e3 * gap:.0f} mm of free space at each pad."
             )
         return tuple(notes)
 

@@ -38,13 +38,12 @@ def grasps_file(path: Path, *poses: tuple[float, ...] | None, robot: str = "pand
 
 def test_the_pregrasp_of_a_grasp_is_a_goal(run: RunCommand, map_file: Path, tmp_path: Path) -> None:
     file = grasps_file(tmp_path / "grasp.json", UPRIGHT, GOAL)
-    words = ("plan", "--map", map_file, *BASE, "--start", "home", "--grasp", file)
-    for index, goal in enumerate((UPRIGHT, GOAL)):
-        out = tmp_path / f"out{index}"
-        answer = run(*words, "--grasp-index", index, "--out", out)
-        assert answer.code == 0, answer.err
-        last = json.loads((out / "trajectory.json").read_text())["points"][-1]["positions"]
-        np.testing.assert_allclose(last, goal, atol=1e-9)
+    out = tmp_path / "out"
+    words = ("plan", "--map", map_file, *BASE, "--start", "home", "--grasp", file, "--grasp-index", 1)
+    answer = run(*words, "--out", out)
+    assert answer.code == 0, answer.err
+    last = json.loads((out / "trajectory.json").read_text())["points"][-1]["positions"]
+    np.testing.assert_allclose(last, GOAL, atol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -228,7 +228,7 @@ def test_a_finger_that_enters_unseen_space_is_not_offered() -> None:
     result = grasps_with(half)
     assert not any(any(g.blind) for g in result.grasps)
     allowed = GraspSampler(scene(), panda(), raw=half, hand_only=True).sample(
-        target_of(scene(), BOX, "box"), GraspOptions(accept_implied=True, wanted=100)
+        target_of(scene(), BOX, "box"), GraspOptions(accept_implied=True, wanted=100, samples=200)
     )
     hidden = [g for g in allowed.grasps if any(g.blind)]
     assert hidden
@@ -248,13 +248,14 @@ def test_an_implied_side_needs_more_free_space_at_the_pad(monkeypatch: pytest.Mo
     assert HAND is not None
     gap = 0.5 * (HAND.stroke - BOX.size[1]) + 0.002  # more than the box leaves
     monkeypatch.setattr(search, "MEASURED", replace(CONSTANTS, implied_gap=gap))
-    result = GraspSampler(scene(), panda(), raw=half, hand_only=True).sample(target)
+    few = GraspOptions(samples=150)
+    result = GraspSampler(scene(), panda(), raw=half, hand_only=True).sample(target, few)
     assert not any(any(g.implied) and g.width > HAND.stroke - 2 * gap for g in result.grasps)
     assert result.doubtful
     assert "wide at an implied contact, too close to the 80 mm that the hand opens" in result.doubtful[0].rejected
     if not result.grasps:
         assert "opens wider" in first_change(result, scene(), HAND.stroke)[1]
-    every = GraspSampler(scene(), panda(), raw=everything(), hand_only=True).sample(target)
+    every = GraspSampler(scene(), panda(), raw=everything(), hand_only=True).sample(target, few)
     assert every.grasps  # its sides are measured
     assert not any("implied contact" in g.rejected for g in every.doubtful)
 

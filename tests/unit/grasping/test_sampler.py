@@ -207,7 +207,8 @@ def test_candidates_of_both_searches_are_counted() -> None:
 
 def test_the_links_before_the_hand_keep_the_margin_of_the_arm_while_the_hand_comes_close() -> None:
     target, margin = target_of(scene(), BOX, "box"), 0.04
-    result = GraspSampler(scene(), panda(), arm_margin=margin).sample(target)
+    few = GraspOptions(samples=100)
+    result = GraspSampler(scene(), panda(), arm_margin=margin).sample(target, few)
     assert result.grasps
     assert min(g.clearance for g in result.grasps) <= 0.03  # of the hand, which is nearer
     rows = np.delete(np.arange(len(scene().model)), target.rows)
@@ -224,7 +225,7 @@ def test_the_links_before_the_hand_keep_the_margin_of_the_arm_while_the_hand_com
             high = spheres.link[links] > 0  # the base stands on the table
             gap = around.clearance(at[high], cut=0.5).distance - spheres.radii[links][high]
             assert gap.min() > margin - 1e-6
-    none = GraspSampler(scene(), panda(), arm_margin=0.4).sample(target)
+    none = GraspSampler(scene(), panda(), arm_margin=0.4).sample(target, few)
     assert not none.grasps
     assert none.rejected["hands: bring the arm within the margin of the map"] > 0
     with pytest.raises(InputError, match="arm_margin"):
