@@ -483,7 +483,7 @@ class Search:
             narrowest, opens, gap = self.found.narrowest, self.s.hand.stroke, HANDS.min_pad_gap
             notes.append(
                 f"The narrowest of its sides that are too wide are {1e3 * narrowest:.0f} mm apart, and the hand opens "
-                f"{1e3 * opens:.0f} mm, with {1e3 * gap:.0f} mm of free space at each pad."
+                f"{1e3 * opens:.0f} mm, less {1e3 * gap:.0f} mm at each pad."
             )
         return tuple(notes)
 
