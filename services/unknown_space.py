@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.collision.unknown import UnknownPolicy
 from splatbot.errors import InputError
-from splatbot.gaussians import GaussianModel
-from splatbot.results.unknown import obstacles, unknown_in_reach
+from splatbot.results.unknown import unknown_in_reach, with_unknown
 from splatbot.robots.in_view import reopen_log
 from splatbot.robots.robot import RobotModel
 from splatbot.services.store import ServedMap
@@ -50,12 +49,4 @@ def field_with_unknown(
         )
     arm = RobotSpheres(robot, T_world_base=T_world_base)
     space = served.derived.get(("unknown space", robot.name), lambda: unknown_in_reach(run, reopen_log(run), arm))
-    model = served.ready.model
-
-    def around(margin: float) -> GaussianCollisionField:
-        solids = obstacles(space, policy, arm, start, margin=margin)
-        if not len(solids):
-            return field
-        return GaussianCollisionField(GaussianModel.concatenate([model, solids]), field.n_sigma)
-
-    return around
+    return with_unknown(field, served.ready.model, space, policy, arm, start)

@@ -18,7 +18,7 @@ from splatbot.results.margin import CONSTANTS as MARGIN
 from splatbot.services.arms import known_robot
 from splatbot.services.codecs import answer, answers, body_of, request_body
 from splatbot.services.dependencies import ServedAfterFrames, Service, problems
-from splatbot.services.margins import margin_source
+from splatbot.services.margins import MarginSource, margin_source
 from splatbot.services.robots_in_maps import base_in, objects_in
 from splatbot.services.schemas import GraspsRequest
 from splatbot.services.topics import GRASPS
@@ -62,7 +62,8 @@ def grasps(request: Request, served: ServedAfterFrames, service: Service, query:
     objects = objects_in(served, base, as_known=query.base is None)
     found = find_target(_hint(query), objects.scene, [LanguageAffordance(), SpatialAffordance()])
     sampler = objects.sampler(robot, hand_only=query.hand_only, min_observations=query.min_observations)
-    source = margin_source(served, query.margin, sampler.field)
+    alone = query.hand_only and query.margin is None
+    source = MarginSource(None, 0.0, "no arm") if alone else margin_source(served, query.margin, sampler.field)
     sampler.margin = source.margin
     if source.error is not None:
         means = objects.scene.model.means.detach().double().numpy()

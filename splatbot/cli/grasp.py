@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from splatbot.cli.paths import check_file, check_output
-from splatbot.cli.placing import Pose, base_pose, margin_value, run_folder
+from splatbot.cli.placing import Pose, base_pose, margin_value, pose_values, run_folder
 from splatbot.errors import InputError, SplatbotError
 from splatbot.layouts import map_file
 
@@ -135,17 +135,18 @@ def grasp(
     hint = _hint(map, index, target=target, pixel=pixel, point=point, box=box, mask=mask, tag=tag)
     found = find_target(hint, scene, [*name_backends(vlm=vlm), SpatialAffordance(), TagAffordance()])
     sampler = objects.sampler(arm, hand_only=hand_only, n_sigma=n_sigma, min_observations=min_observations)
-    margin_text = _set_margin(sampler, margin, map, found)
+    margin_text = _set_margin(sampler, "0" if hand_only and margin is None else margin, map, found)
     result = objects.with_notes(sampler.sample(found, options))
     folder = out if out is not None else Path("runs") / "grasp"
     folder.mkdir(parents=True, exist_ok=True)
     with atomic_write(folder / "grasp.json") as handle:
-        margins = {
+        placed = {
             "robot": arm.name,
+            "T_world_base": pose_values(scene.T_world_base),
             "margin_m": sampler.margin,
             "arm_margin_m": max(sampler.margin, sampler.arm_margin),
         }
-        handle.write(json.dumps(summary(result) | margins, indent=2).encode())
+        handle.write(json.dumps(summary(result) | placed, indent=2).encode())
     shown = next(iter((*result.grasps, *result.doubtful)), result.best_rejected)
     if shown is not None:
         with atomic_write(folder / "grasp.png") as handle:
@@ -158,7 +159,8 @@ def grasp(
     result.unwrap()
     _print(result, folder, margin_text, verbose=verbose)
     if not hand_only:
-        print_text(f"next: splatbot plan --map {map} --robot {robot} --start home --grasp {folder / 'grasp.json'}")
+        at = "" if base is None else f" --base {' '.join(str(value) for value in base)}"
+        print_text(f"next: splatbot plan --map {map} --robot {robot}{at} --start home --grasp {folder / 'grasp.json'}")
     return 0
 
 

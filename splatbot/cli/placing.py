@@ -49,6 +49,13 @@ def base_pose(pose: Pose | None, map_: Path) -> NDArray[np.float64]:
     return known.T_world_base
 
 
+def pose_values(T: NDArray[np.float64]) -> dict[str, list[float]]:
+    """Return a pose (4, 4) as JSON values: translation [m] and quaternion_wxyz."""
+    from splatbot.geometry import rotation_to_quat
+
+    return {"translation": T[:3, 3].tolist(), "quaternion_wxyz": rotation_to_quat(T[:3, :3]).tolist()}
+
+
 def run_folder(map_: Path, flag: str) -> RunFolder:
     """Return the run folder that a flag requires.
 

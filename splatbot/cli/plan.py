@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from splatbot.cli.paths import check_file, check_output
-from splatbot.cli.placing import Pose, base_pose, checked_pose, margin_value, run_folder
+from splatbot.cli.placing import Pose, base_pose, checked_pose, margin_value, pose_values, run_folder
 from splatbot.errors import InputError
 from splatbot.layouts import map_file
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from splatbot.collision import GaussianCollisionField
+    from splatbot.collision import GaussianCollisionField, RobotSpheres
     from splatbot.collision.unknown import UnknownPolicy
     from splatbot.gaussians import GaussianModel
     from splatbot.planning import GaussianRRTStar, JointTrajectory, PlanResult
@@ -92,7 +92,7 @@ def plan(
     import numpy as np
 
     from splatbot.atomic import replace_files, write_bytes, write_text
-    from splatbot.collision import GaussianCollisionField
+    from splatbot.collision import GaussianCollisionField, RobotSpheres
     from splatbot.gaussians import GaussianModel
     from splatbot.planning import GaussianRRTStar, PoseGoal
     from splatbot.report.plan_page import plan_html, plan_png
@@ -108,21 +108,15 @@ def plan(
     if goal_pose is not None:
         wanted = PoseGoal(T_world_base @ checked_pose(goal_pose, "--goal-pose"))
     elif grasp is not None:
-        wanted = _pregrasp(grasp, grasp_index, arm)
+        wanted = _pregrasp(grasp, grasp_index, arm, T_world_base)
     else:
         wanted = _joints(goal or (), arm, "--goal")
     of_map = GaussianCollisionField(model, n_sigma)
-    unknown_at = _unknown_solids(map, unknown, arm, T_world_base, here)
-
-    def make_planner(keep: float) -> GaussianRRTStar:
-        solids = unknown_at(keep)
-        everything = GaussianCollisionField(GaussianModel.concatenate([model, solids]), n_sigma) if solids else of_map
-        return GaussianRRTStar(everything, arm, T_world_base=T_world_base, margin=keep)
-
+    field_at = _field_with_unknown(map, of_map, model, unknown, RobotSpheres(arm, T_world_base=T_world_base), here)
     found = _plan(
         map,
         of_map,
-        make_planner,
+        lambda keep: GaussianRRTStar(field_at(keep), arm, T_world_base=T_world_base, margin=keep),
         lambda planner: planner.plan(here, wanted, budget_ms=budget_ms, seed=seed),
         here if goal_pose is not None else np.stack([here, wanted]),
         margin="auto" if margin is None and map.is_dir() else margin or "0",
@@ -151,20 +145,22 @@ def plan(
     return 0
 
 
-def _unknown_solids(
-    map_: Path, policy: UnknownPolicy, arm: RobotModel, T_world_base: NDArray[np.float64], here: NDArray[np.float64]
-) -> Callable[[float], GaussianModel | None]:
-    """Return a function of the margin [m] that gives the unknown space of a run as Gaussians, None if it is free."""
-    from splatbot.collision import RobotSpheres
-    from splatbot.results.unknown import obstacles, unknown_in_reach
+def _field_with_unknown(
+    map_: Path,
+    of_map: GaussianCollisionField,
+    model: GaussianModel,
+    policy: UnknownPolicy,
+    arm: RobotSpheres,
+    here: NDArray[np.float64],
+) -> Callable[[float], GaussianCollisionField]:
+    """Return a function of the margin [m] that gives the field of a map with its unknown space under a policy."""
+    from splatbot.results.unknown import unknown_in_reach, with_unknown
     from splatbot.robots.in_view import reopen_log
 
     if policy == "free":
-        return lambda margin: None
+        return lambda margin: of_map
     run = run_folder(map_, "--unknown")
-    spheres = RobotSpheres(arm, T_world_base=T_world_base)
-    space = unknown_in_reach(run, reopen_log(run), spheres)
-    return lambda margin: obstacles(space, policy, spheres, here, margin=margin) or None
+    return with_unknown(of_map, model, unknown_in_reach(run, reopen_log(run), arm), policy, arm, here)
 
 
 def _plan(
@@ -189,26 +185,30 @@ def _plan(
     return plan_at_margin(make_planner(margin_value(margin)), plan_once, speed=speed)
 
 
-def _pregrasp(path: Path, index: int, robot: RobotModel) -> NDArray[np.float64]:
+def _pregrasp(path: Path, index: int, robot: RobotModel, T_world_base: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the joint values (J,) of the pre-grasp in a file of `splatbot grasp`.
 
     Raises:
         FormatError: the file is no such file.
-        InputError: its grasps are of another robot, or it has no such grasp.
+        InputError: its grasps are of another robot or another base, or it has no such grasp.
     """
     import numpy as np
 
     from splatbot.errors import FormatError
+    from splatbot.geometry import pose_from_quat
 
     try:
         found = json.loads(path.read_text())
         grasps, of = found["grasps"], found["robot"]
+        base = pose_from_quat(found["T_world_base"]["translation"], found["T_world_base"]["quaternion_wxyz"])
         q = np.array([grasp["q_pregrasp"] or [] for grasp in grasps[index : index + 1]], dtype=np.float64)
     except (ValueError, TypeError, KeyError, UnicodeDecodeError) as error:
         hint = "give the grasp.json of `splatbot grasp`"
         raise FormatError(f"is no file of grasps ({error!r}).", file=path, hint=hint) from error
     if of != robot.name:
         raise InputError(f"has grasps of {of}, not {robot.name}.", file=path, field="robot", hint=f"give --robot {of}")
+    if not np.allclose(base, T_world_base, rtol=0.0, atol=1e-6):
+        raise InputError("is another base.", file=path, field="T_world_base", hint="give the --base of the grasps")
     if not 0 <= index < len(grasps):
         hint = f"give 0 to {len(grasps) - 1}" if grasps else "search for grasps again"
         raise InputError(f"is {index}, of {len(grasps)} grasps.", field="--grasp-index", hint=hint)
@@ -237,17 +237,12 @@ def _joints(words: tuple[str, ...], robot: RobotModel, flag: str) -> NDArray[np.
 def _summary(
     arm: RobotModel, T_world_base: NDArray[np.float64], result: PlanResult, trajectory: JointTrajectory
 ) -> dict[str, Any]:
-    from splatbot.geometry import rotation_to_quat
-
     assert result.path is not None
     c = trajectory.certificate
     return {
         "robot": arm.name,
         "joint_names": list(trajectory.names),
-        "T_world_base": {
-            "translation": T_world_base[:3, 3].tolist(),
-            "quaternion_wxyz": rotation_to_quat(T_world_base[:3, :3]).tolist(),
-        },
+        "T_world_base": pose_values(T_world_base),
         "status": result.status.name,
         "code": int(result.status),
         "cost_rad": result.path.cost,

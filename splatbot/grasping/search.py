@@ -15,6 +15,7 @@ from splatbot.collision import GaussianCollisionField
 from splatbot.gaussians import GaussianModel
 from splatbot.grasping.affordance import Target
 from splatbot.grasping.antipodal import Pairs, PairSearch, antipodal_pairs
+from splatbot.grasping.doubts import doubt
 from splatbot.grasping.hands import CONSTANTS as HANDS
 from splatbot.grasping.hands import Hands, measure_hands, palm_free, place_hands, usable_opening
 from splatbot.grasping.measured import CONSTANTS as MEASURED
@@ -285,6 +286,7 @@ class Search:
         the fingers earlier.
         """
         assert self.measured is not None
+        assert self.s.raw is not None
         hands = scored.hands
         deep = hand_penetration(hands, self.measured, self.s.hand, retreat=self.o.pregrasp)
         wider = closed_width(hands, self.measured, self.s.hand) - self.pairs.width[hands.pair]
@@ -302,14 +304,11 @@ class Search:
                 reason = f"has measured depth under its pads, so that it closes {1e3 * wider[k]:.0f} mm wider"
             self.log.best = self._grasp(scored, k, rejected=reason)
         kept = scored.select(free)
-        assert self.s.raw is not None
         hidden = blind(away[free], self.s.raw.unseen(kept.hands, self.s.hand)).any(axis=1)
-        tight = self._tight(self.pairs.width[kept.hands.pair]) & (kept.terms["measured"] < 1.0)
-        return kept.select(np.lexsort((-kept.totals, hidden | tight | (kept.terms["measured"] == 0.0))))
-
-    def _tight(self, width: Array) -> NDArray[np.bool_]:
-        """Return whether widths (K,) [m] leave the pads less free space than implied contacts need."""
-        return np.asarray(self.s.hand.stroke - width < 2 * MEASURED.implied_gap)
+        tight = self.s.hand.stroke - self.pairs.width[kept.hands.pair] < 2 * MEASURED.implied_gap
+        measured = kept.terms["measured"]
+        doubtful = hidden | (tight & (measured < 1.0)) | (measured == 0.0)
+        return kept.select(np.lexsort((-kept.totals, doubtful)))
 
     def _reached(
         self, scored: _Scored, reach: ReachabilityCheck | None, avoid_moving: ReachabilityCheck | None
@@ -441,28 +440,8 @@ class Search:
 
     def _by_evidence(self, grasps: Sequence[Grasp]) -> tuple[tuple[Grasp, ...], tuple[Grasp, ...]]:
         """Split grasps into those to offer, and those that are too doubtful, with the reason."""
-        judged = [replace(grasp, rejected=self._doubt(grasp)) for grasp in grasps]
+        judged = [replace(grasp, rejected=doubt(grasp, self.o, self.s.hand)) for grasp in grasps]
         return tuple(g for g in judged if not g.rejected), tuple(g for g in judged if g.rejected)
-
-    def _doubt(self, grasp: Grasp) -> str:
-        """Return why a grasp should not be executed; empty if it may be."""
-        if grasp.confidence < self.o.min_confidence:
-            return f"has a confidence of {grasp.confidence:.2f}, less than {self.o.min_confidence:g}"
-        if self.o.accept_implied or grasp.depth_distance is None or grasp.unseen is None:
-            return ""
-        if np.isinf(grasp.depth_distance).any() and all(grasp.implied):
-            return "has no contact at measured depth, nor any depth near it"
-        if all(grasp.implied):
-            away = " and ".join(f"{1e3 * value:.0f}" for value in grasp.depth_distance)
-            return f"has no contact at measured depth, which is {away} mm away"
-        if any(grasp.implied) and self._tight(np.array([grasp.width]))[0]:
-            width, most = 1e3 * grasp.width, 1e3 * self.s.hand.stroke
-            return f"is {width:.0f} mm wide at an implied contact, too close to the {most:.0f} mm that the hand opens"
-        for hidden, away, unseen in zip(grasp.blind, grasp.depth_distance, grasp.unseen, strict=True):
-            if hidden:
-                why = f"{unseen:.0%} of its face is in unseen space"
-                return f"has a finger where the object may continue: {why}, {1e3 * away:.0f} mm from measured depth"
-        return ""
 
     def _notes(self, grasps: Sequence[Grasp]) -> tuple[str, ...]:
         notes = []

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from splatbot.collision import RobotSpheres, UnknownSpace, find_unknown
+from splatbot.collision import GaussianCollisionField, RobotSpheres, UnknownSpace, find_unknown
 from splatbot.collision.unknown import UnknownPolicy
 from splatbot.errors import SplatbotError
 from splatbot.gaussians import GaussianModel
@@ -69,6 +70,34 @@ def obstacles(
     q = np.atleast_2d(np.asarray(occupied, dtype=np.float64))
     centers, radii = arm.centers(q).reshape(-1, 3), np.tile(arm.spheres.radii + margin, len(q))
     return space.without(np.c_[centers, radii]).solids(policy=policy)
+
+
+def with_unknown(
+    field: GaussianCollisionField,
+    model: GaussianModel,
+    space: UnknownSpace,
+    policy: UnknownPolicy,
+    arm: RobotSpheres,
+    start: ArrayLike,
+) -> Callable[[float], GaussianCollisionField]:
+    """Return a function of the margin [m] that gives the field of a map with its unknown space as obstacles.
+
+    Args:
+        field: collision field of the map.
+        model: the map.
+        space: its unknown space.
+        policy: treatment of unknown space.
+        arm: the arm.
+        start: (J,) configuration at which it is [rad or m].
+    """
+
+    def around(margin: float) -> GaussianCollisionField:
+        solids = obstacles(space, policy, arm, start, margin=margin)
+        if not len(solids):
+            return field
+        return GaussianCollisionField(GaussianModel.concatenate([model, solids]), field.n_sigma)
+
+    return around
 
 
 _MEANINGS = {

@@ -7,11 +7,11 @@ from itertools import pairwise
 
 import numpy as np
 import open3d as o3d
-import torch
 from scipy.spatial import cKDTree
 
 from splatbot.bench.benchmark import ReportProgress, ignore_progress
 from splatbot.bench.grasping import GraspingSettings
+from splatbot.bench.grasping.scenes import over_scenes
 from splatbot.bench.machine import describe_machine
 from splatbot.bench.results import Results
 from splatbot.geometry import inverse, transform_points
@@ -56,20 +56,13 @@ class OneSidedContact:
 def run_one_sided(settings: GraspingSettings, report_progress: ReportProgress = ignore_progress) -> Results:
     """Scan scenes over an azimuth of 50 degrees, and compare the fingers of all grasps with the true shapes."""
     results = Results(describe_machine((1,), peak_ms=settings.peak_ms))
-    contacts: list[OneSidedContact] = []
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        for seed in range(settings.first, settings.first + settings.one_sided):
-            report_progress(f"scene {seed}, {len(contacts)} contacts so far")
-            contacts += _contacts(seed)
-    finally:
-        torch.set_num_threads(threads)
-    offered = [contact for contact in contacts if contact.offered]
+    seeds = range(settings.first, settings.first + settings.one_sided)
+    contacts = over_scenes(seeds, _contacts, "contacts", report_progress)
+    near = [contact for contact in contacts if contact.away <= MEASURED.unseen_from]
     far = [contact for contact in contacts if contact.away > MEASURED.unseen_from]
-    _add(results, "one side / offered grasps", offered)
+    _add(results, "one side / offered grasps", [contact for contact in contacts if contact.offered])
     _add(results, "one side / doubtful grasps", [contact for contact in contacts if not contact.offered])
-    _add(results, "one side / contacts within 6 mm of depth", [c for c in contacts if c not in far])
+    _add(results, "one side / contacts within 6 mm of depth", near)
     for low, high in pairwise(_EDGES):
         chosen = [c for c in far if low <= c.unseen < high or c.unseen == high == 1.0]
         _add(results, f"one side / farther contacts, {low:g} to {high:g} unseen", chosen)

@@ -8,10 +8,10 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from splatbot.bench.benchmark import ReportProgress, ignore_progress
 from splatbot.bench.grasping import GraspingSettings
+from splatbot.bench.grasping.scenes import over_scenes
 from splatbot.bench.machine import describe_machine
 from splatbot.bench.results import Results
 from splatbot.grasping.affordance import AffordanceError
@@ -39,15 +39,8 @@ class ExecutedGrasp:
 def run_reliability(settings: GraspingSettings, report_progress: ReportProgress = ignore_progress) -> Results:
     """Execute up to five grasps in each of some scenes, and compare confidence with the share of successes."""
     results = Results(describe_machine((1,), peak_ms=settings.peak_ms))
-    rows: list[ExecutedGrasp] = []
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        for seed in range(settings.first, settings.first + settings.reliability):
-            report_progress(f"scene {seed}, {len(rows)} grasps so far")
-            rows += execute_grasps(seed)
-    finally:
-        torch.set_num_threads(threads)
+    seeds = range(settings.first, settings.first + settings.reliability)
+    rows = over_scenes(seeds, execute_grasps, "grasps", report_progress)
     add_reliability(results, rows)
     return results
 

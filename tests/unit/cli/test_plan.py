@@ -6,6 +6,7 @@ import base64
 import csv
 import json
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -30,9 +31,12 @@ def map_file(tmp_path: Path) -> Path:
     return path
 
 
+STANDING = {"translation": [0, 0, 0], "quaternion_wxyz": [1, 0, 0, 0]}
+
+
 def grasps_file(path: Path, *poses: tuple[float, ...] | None, robot: str = "panda") -> Path:
     grasps = [{"q_pregrasp": None if q is None else list(q)} for q in poses]
-    path.write_text(json.dumps({"robot": robot, "grasps": grasps}))
+    path.write_text(json.dumps({"robot": robot, "T_world_base": STANDING, "grasps": grasps}))
     return path
 
 
@@ -47,28 +51,36 @@ def test_the_pregrasp_of_a_grasp_is_a_goal(run: RunCommand, map_file: Path, tmp_
 
 
 @pytest.mark.parametrize(
-    ("text", "index", "why"),
+    ("changes", "index", "why"),
     [
-        ("{", 0, "is no file of grasps"),
-        ("[]", 0, "is no file of grasps"),
-        ('{"robot": "panda", "grasps": [{}]}', 0, "is no file of grasps"),
-        ('{"robot": "panda", "grasps": []}', 0, "--grasp-index: is 0, of 0 grasps"),
-        ('{"robot": "panda", "grasps": [{"q_pregrasp": [0]}]}', 0, "has no joint values"),
-        ('{"robot": "panda", "grasps": [{"q_pregrasp": null}]}', 0, "has no joint values"),
-        ('{"robot": "panda", "grasps": [{"q_pregrasp": [0, 0, 0, NaN, 0, 0, 0]}]}', 0, "has no joint values"),
-        ('{"robot": "panda", "grasps": [{"q_pregrasp": null}]}', -1, "--grasp-index: is -1"),
-        ('{"robot": "ur5e-2f85", "grasps": [{"q_pregrasp": null}]}', 0, "give --robot ur5e-2f85"),
+        ({"grasps": None}, 0, "is no file of grasps"),
+        ({"grasps": [{}]}, 0, "is no file of grasps"),
+        ({"T_world_base": {"translation": [0, 0]}}, 0, "is no file of grasps"),
+        ({"grasps": []}, 0, "--grasp-index: is 0, of 0 grasps"),
+        ({"grasps": [{"q_pregrasp": [0]}]}, 0, "has no joint values"),
+        ({"grasps": [{"q_pregrasp": None}]}, 0, "has no joint values"),
+        ({"grasps": [{"q_pregrasp": [0, 0, 0, float("nan"), 0, 0, 0]}]}, 0, "has no joint values"),
+        ({}, -1, "--grasp-index: is -1"),
+        ({"robot": "ur5e-2f85"}, 0, "give --robot ur5e-2f85"),
+        ({"T_world_base": STANDING | {"translation": [0, 0, 0.01]}}, 0, "give the --base of the grasps"),
     ],
 )
 def test_files_of_grasps_that_give_no_goal_are_refused(
-    run: RunCommand, map_file: Path, tmp_path: Path, text: str, index: int, why: str
+    run: RunCommand, map_file: Path, tmp_path: Path, changes: dict[str, Any], index: int, why: str
 ) -> None:
     file = tmp_path / "grasp.json"
-    file.write_text(text)
+    good = {"robot": "panda", "T_world_base": STANDING, "grasps": [{"q_pregrasp": list(GOAL)}]}
+    file.write_text(json.dumps(good | changes))
     words = ("plan", "--map", map_file, *BASE, "--start", "home", "--out", tmp_path / "out")
-    answer = run(*words, "--grasp", file, "--grasp-index", index)
-    assert_refused(answer, why)
+    assert_refused(run(*words, "--grasp", file, "--grasp-index", index), why)
     assert not (tmp_path / "out").exists()
+
+
+def test_a_file_that_is_no_json_and_two_goals_are_refused(run: RunCommand, map_file: Path, tmp_path: Path) -> None:
+    file = tmp_path / "grasp.json"
+    file.write_text("{")
+    words = ("plan", "--map", map_file, *BASE, "--start", "home")
+    assert_refused(run(*words, "--grasp", file), "is no file of grasps")
     assert_refused(run(*words, "--grasp", file, "--goal", "home"), "must be given, one of them")
     assert_refused(run(*words), "must be given, one of them")
 

@@ -242,12 +242,12 @@ def test_a_finger_that_enters_unseen_space_is_not_offered() -> None:
 
 
 def test_an_implied_side_needs_more_free_space_at_the_pad(monkeypatch: pytest.MonkeyPatch) -> None:
-    from splatbot.grasping import search
+    from splatbot.grasping import doubts
 
     half, target = raw(TABLE, *OBJECTS.values(), turns=np.linspace(-1.2, 0.0, 8)), target_of(scene(), BOX, "box")
     assert HAND is not None
     gap = 0.5 * (HAND.stroke - BOX.size[1]) + 0.002  # more than the box leaves
-    monkeypatch.setattr(search, "MEASURED", replace(CONSTANTS, implied_gap=gap))
+    monkeypatch.setattr(doubts, "CONSTANTS", replace(CONSTANTS, implied_gap=gap))
     few = GraspOptions(samples=150)
     result = GraspSampler(scene(), panda(), raw=half, hand_only=True).sample(target, few)
     assert not any(any(g.implied) and g.width > HAND.stroke - 2 * gap for g in result.grasps)
