@@ -210,8 +210,8 @@ def load_motion(path: str | Path, robot: RobotModel) -> JointMotion:
             f"is no trajectory of {robot.name} ({error}).",
             file=file,
             field="trajectory",
-            hint=f"plan with {robot.name}, or write JointTrajectory JSON or CSV with time and "
-            f"position.{robot.chain.names[0]} and so on",
+            hint="name the robot that it was planned with (`twin --robot`), or write JointTrajectory JSON or CSV with "
+            f"time and position.{robot.chain.names[0]} and so on",
         ) from error
     try:
         return motion_from_samples(*values)

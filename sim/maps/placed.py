@@ -15,12 +15,13 @@ _G = 9.81  # [m/s²]
 _MAP = "map.ply"
 
 
-def placed_scene(place: Path) -> dict[str, Any]:
+def placed_scene(place: Path, *, T_world_base: Array | None = None) -> dict[str, Any]:
     """Return the values for :func:`splatbot.sim.scene.make_scene`: the map in the frame of the robot's base.
 
     Args:
         place: a run's folder, or a map file. Without a `scene.yaml` next to a map
             file, its own frame is that of the base.
+        T_world_base: (4, 4) pose of the base [m]. If None, it is that of the `scene.yaml`.
 
     Raises:
         InputError: the folder has no map, or the run has no base pose.
@@ -31,12 +32,13 @@ def placed_scene(place: Path) -> dict[str, Any]:
         raise InputError(f"holds no {_MAP}.", file=place, field="--map", hint="give a map file, or the folder of a run")
     known = find_workspace(file)
     values: dict[str, Any] = {"name": place.resolve().stem, "map": {"file": str(file.resolve())}}
-    if known is None or known.T_world_base is None:
+    placed = T_world_base if known is None or T_world_base is not None else known.T_world_base
+    if placed is None:
         if place.is_dir():
-            hint = "write a scene.yaml: splatbot info RUN --fit-plane estimates one"
+            hint = "give --base, or write a scene.yaml: splatbot info RUN --fit-plane estimates one"
             raise InputError("does not define the base pose.", field="T_world_base", file=place, hint=hint)
         return values
-    return values | _placed(values["map"], known, inverse(known.T_world_base))
+    return values | _placed(values["map"], known or Workspace(), inverse(placed))
 
 
 def _placed(clutter: dict[str, Any], known: Workspace, T_base_world: Array) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from splatbot.cli.paths import check_file, check_output
-from splatbot.cli.placing import Pose, base_pose, margin_value, pose_values, run_folder
+from splatbot.cli.placing import Pose, base_pose, base_words, margin_value, pose_values, run_folder
 from splatbot.errors import InputError, SplatbotError
 from splatbot.layouts import map_file
 
@@ -159,8 +159,8 @@ def grasp(
     result.unwrap()
     _print(result, folder, margin_text, verbose=verbose)
     if not hand_only:
-        at = "" if base is None else f" --base {' '.join(str(value) for value in base)}"
-        print_text(f"next: splatbot plan --map {map} --robot {robot}{at} --start home --grasp {folder / 'grasp.json'}")
+        on = f"--map {map} --robot {robot}{base_words(base)}"
+        print_text(f"next: splatbot plan {on} --start home --grasp {folder / 'grasp.json'}")
     return 0
 
 

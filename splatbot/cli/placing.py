@@ -49,6 +49,11 @@ def base_pose(pose: Pose | None, map_: Path) -> NDArray[np.float64]:
     return known.T_world_base
 
 
+def base_words(pose: Pose | None) -> str:
+    """Return the option that gives the same base to the next command, with a space before it; empty for the default."""
+    return "" if pose is None else f" --base {' '.join(str(value) for value in pose)}"
+
+
 def pose_values(T: NDArray[np.float64]) -> dict[str, list[float]]:
     """Return a pose (4, 4) as JSON values: translation [m] and quaternion_wxyz."""
     from splatbot.geometry import rotation_to_quat

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from splatbot.cli.paths import check_file, check_output
-from splatbot.cli.placing import Pose, base_pose, checked_pose, margin_value, pose_values, run_folder
+from splatbot.cli.placing import Pose, base_pose, base_words, checked_pose, margin_value, pose_values, run_folder
 from splatbot.errors import InputError
 from splatbot.layouts import map_file
 
@@ -92,6 +92,7 @@ def plan(
     import numpy as np
 
     from splatbot.atomic import replace_files, write_bytes, write_text
+    from splatbot.cli.tables import print_text
     from splatbot.collision import GaussianCollisionField, RobotSpheres
     from splatbot.gaussians import GaussianModel
     from splatbot.planning import GaussianRRTStar, PoseGoal
@@ -142,6 +143,8 @@ def plan(
     picture = plan_png(model, found.planner.arm, trajectory, appearance(arm), arm.fk)
     replace_files(folder, writers | {"plan.png": write_bytes(picture)})
     _print(result, trajectory, covers, folder)
+    next_ = f"splatbot twin --map {map} --robot {robot}{base_words(base)} --trajectory {folder / 'trajectory.json'}"
+    print_text(f"next: {next_}")
     return 0
 
 

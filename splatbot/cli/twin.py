@@ -12,6 +12,7 @@ import tyro
 
 from splatbot.cli.drawing import draw_offscreen
 from splatbot.cli.paths import check_file, check_output
+from splatbot.cli.placing import Pose, checked_pose
 from splatbot.errors import InputError
 from splatbot.layouts import map_file
 
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
 def twin(
     scene: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE")] = None,
     map: Annotated[Path | None, tyro.conf.arg(metavar="RUN|FILE")] = None,
+    robot: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None,
+    base: Annotated[Pose | None, tyro.conf.arg(metavar="X Y Z QW QX QY QZ")] = None,
     trajectory: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
     json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
     video: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
@@ -47,12 +50,15 @@ def twin(
         splatbot twin --scene mug_hanging --video mug.mp4 --html mug.html
         splatbot twin --scene wiping --forbid backlash --json result.json
         splatbot twin --map runs/latest --trajectory runs/plan/trajectory.json
+        splatbot twin --map runs/latest --robot ur5e-2f85 --trajectory runs/plan/trajectory.json --video ur5e.mp4
         splatbot twin --scene my_scene.yaml --seed 3
 
     Args:
         scene: a shipped scene (--list) or a YAML file.
         map: a run's folder or a Gaussian map: table, objects, clutter are fitted. The scene.yaml next to it defines
             the base of the robot. Without one, the map is in the robot's frame (z up, base at the origin).
+        robot: its name, as of `splatbot robot list`; by default that of the scene, or the Panda in a map.
+        base: pose of the robot's base in the map; by default that of the scene.yaml next to the map.
         trajectory: ROS JointTrajectory as JSON, or CSV; by default the moves of the scene's task.
         json: file for the whole result.
         video: MP4 of the scene's camera.
@@ -76,17 +82,20 @@ def twin(
         )
     if map is not None:
         map_file(map)
+    elif base is not None:
+        raise InputError("places a robot in a map.", field="--base", hint="give --map, or `at` in the scene's file")
     check_file(trajectory, "--trajectory")
     for flag, path in (("--json", json), ("--video", video), ("--html", html)):
         check_output(path, flag, folder=False)
 
+    from splatbot.robots.store import load_robot
     from splatbot.sim.ledger import ledger
     from splatbot.sim.motion import load_motion
     from splatbot.sim.recording import TwinRecording
     from splatbot.sim.twin import Twin
 
-    chosen = _scene(scene, map, with_camera=video is not None).with_effects(force=force, forbid=forbid)
-    it = Twin(chosen, timestep=timestep, seed=seed)
+    chosen = _scene(scene, map, base, with_camera=video is not None).with_effects(force=force, forbid=forbid)
+    it = Twin(chosen, robot=None if robot is None else load_robot(robot), timestep=timestep, seed=seed)
     motion = None
     if trajectory is not None and it.world.robot is not None:
         motion = load_motion(trajectory, it.world.robot)
@@ -104,13 +113,13 @@ def twin(
     return 1 if _harm(chosen, result) else 0
 
 
-def _scene(name: str | None, map: Path | None, *, with_camera: bool) -> Scene:
+def _scene(name: str | None, map: Path | None, base: Pose | None, *, with_camera: bool) -> Scene:
     from splatbot.sim.maps.placed import placed_scene
     from splatbot.sim.scene import load_scene, make_scene
 
     values: dict[str, Any] = {}
     if map is not None:
-        values = placed_scene(map)
+        values = placed_scene(map, T_world_base=None if base is None else checked_pose(base, "--base"))
     else:
         assert name is not None
         found = load_scene(name)

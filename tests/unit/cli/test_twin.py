@@ -46,9 +46,29 @@ def test_an_arm_that_touches_the_map_ends_with_1(run: RunCommand, tmp_path: Path
     assert "Gaussians as" in answer.out
 
 
+def test_a_plan_of_another_robot_at_another_base_runs_in_the_twin_of_the_map(run: RunCommand, tmp_path: Path) -> None:
+    tabletop().gaussians(4000).save(tmp_path / "map.ply")
+    of = ("--map", tmp_path / "map.ply", "--robot", "ur5e-2f85", "--base", 0.05, 0, 0, 1, 0, 0, 0)
+    goal = (0.4, -1.4, 1.2, -1.3, -1.5, 0.2)
+    planned = run("plan", *of, "--start", "home", "--goal", *goal, "--speed", 1, "--out", tmp_path / "out")
+    assert planned.code == 0, planned.err
+    assert "next: splatbot twin --map" in planned.out
+    simulated = ("twin", *of, "--trajectory", tmp_path / "out" / "trajectory.json", "--no-costs")
+    answer = run(*simulated, "--json", tmp_path / "r.json")
+    assert answer.code == 0, answer.err
+    values = json.loads((tmp_path / "r.json").read_text())
+    clearance = json.loads((tmp_path / "out" / "plan.json").read_text())["clearance_m"]
+    assert values["contacts"] == []
+    assert values["tracking"]["tcp"] < 1e-3
+    assert clearance > 0.0
+    assert values["clearance"]["value"] > 0.0
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
+        (("--scene", "empty", "--base", "0", "0", "0", "1", "0", "0", "0"), "--base: places a robot in a map"),
+        (("--scene", "empty", "--robot", "r2d2"), "r2d2"),
         ((), "needs either a scene or a map"),
         (("--scene", "empty", "--map", "a.ply"), "needs either a scene or a map"),
         (("--scene", "kitchen"), "there is no scene 'kitchen'"),
