@@ -42,6 +42,16 @@ _CHANGES = (
         "the arm collides on its way to it",
         "correct the base in scene.yaml, or check --hand-only",
     ),
+    (
+        "where no plan may end",
+        "its pre-grasps are too near to the map or in unknown space",
+        "give another distance (--pregrasp 0.15), map the place from more sides, or let unknown space be free",
+    ),
+    (
+        "into unknown space",
+        "the arm would enter unknown space on its way",
+        "map the place from more sides, or let unknown space be free",
+    ),
     ("blocked approach", "its approach is blocked", "give a shorter approach: --pregrasp 0.05"),
 )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Protocol
@@ -91,6 +92,9 @@ class ArmReach:
         whole: field of the whole map, of which the arm must be free at the pre-grasp. If None, this is not checked.
         margin: clearance that arm and hand keep from the map [m].
         arm_margin: the same for the links before the hand alone [m].
+        departure: fields that a plan to the pre-grasp avoids. At the pre-grasp the robot, with its hand fully open,
+            is farther than both margins from them.
+        unknown: field of unknown space. The links before the hand keep both margins from it on the whole approach.
         seed: seed of inverse kinematics.
     """
 
@@ -103,12 +107,15 @@ class ArmReach:
         *,
         margin: float = 0.0,
         arm_margin: float = 0.0,
+        departure: Sequence[GaussianCollisionField] = (),
+        unknown: GaussianCollisionField | None = None,
         seed: int = 0,
     ) -> None:
         for name, value in (("margin", margin), ("arm_margin", arm_margin)):
             if not 0.0 <= value < np.inf:
                 raise InputError(f"is {value}.", field=name, hint="give metres, 0 or more")
         self.robot, self.around, self.whole, self.seed = robot, around, whole, seed
+        self.departure = tuple(departure)
         stroke = hand_of(robot).stroke
 
         @cache
@@ -117,7 +124,17 @@ class ArmReach:
             return RobotSpheres(robot, T_world_base=T_world_base, opening=width, margin=margin)
 
         self._arm = arm
-        self._links = arm(0).without_hand(arm_margin) if arm_margin > margin else None
+        most = max(margin, arm_margin)
+        self._open = RobotSpheres(robot, T_world_base=T_world_base, margin=most)
+        links = self._open.without_hand(most)
+        self._links = [
+            (links, field, what, kind)
+            for field, what, kind in (
+                (around if arm_margin > margin else None, "the map", "bring the arm within the margin of the map"),
+                (unknown, "unknown space", "bring the arm into unknown space"),
+            )
+            if field is not None
+        ]
 
     def arm(self, opening: float) -> RobotSpheres:
         """Return the arm's spheres with the fingers opened to ``opening`` [m], rounded up to 2 mm."""
@@ -147,10 +164,13 @@ class ArmReach:
             if self.whole is not None and arm.check(self.whole, start[None]).in_collision[0]:
                 reason, kind = "the arm touches the target before it approaches", "have a blocked approach"
                 continue
+            if any(self._open.check(field, start[None]).in_collision[0] for field in self.departure):
+                reason, kind = "no plan may end at its pre-grasp", "start where no plan may end"
+                continue
             way = back.path.waypoints
-            if self._links is not None and self._links.certify(self.around, way[:-1], way[1:]).in_collision.any():
-                reason = f"the arm comes nearer than {1e3 * self._links.margin:.1f} mm to the map on its approach"
-                kind = "bring the arm within the margin of the map"
+            near = next((each for each in self._links if _meets(*each[:2], way)), None)
+            if near is not None:
+                reason, kind = f"the arm comes within {_mm(near[0].margin)} of {near[2]} on its approach", near[3]
                 continue
             clearance = float(back.path.certificate.clearance)
             return Reached(q, back.path.waypoints[::-1].copy(), clearance, self._limits(q))
@@ -160,3 +180,11 @@ class ArmReach:
         chain = self.robot.chain
         half = (chain.upper - chain.lower) / 2
         return float((np.minimum(q - chain.lower, chain.upper - q) / half).min())
+
+
+def _meets(arm: RobotSpheres, field: GaussianCollisionField, way: Array) -> bool:
+    return bool(arm.certify(field, way[:-1], way[1:]).in_collision.any())
+
+
+def _mm(length: float) -> str:
+    return f"{1e3 * length:.1f} mm"

@@ -45,6 +45,10 @@ class GraspSampler:
         margin: clearance that arm and hand keep from the map [m].
         arm_margin: the same for the links before the hand alone [m]. The hand has to come close, and is checked
             against raw depth.
+        departure: fields that a plan to a pre-grasp avoids, as the map at the size of a plan's Gaussians; see
+            :class:`splatbot.grasping.reach.ArmReach`.
+        unknown: field of unknown space, which the links before the hand avoid on the approach. Unseen space between
+            the fingers is judged by ``raw``.
         moving: (V, 4) balls (x, y, z, radius) [m, world] of regions where motion was observed; see
             :func:`splatbot.collision.find_moving`. Grasps that avoid them score higher.
 
@@ -66,6 +70,8 @@ class GraspSampler:
         min_observations: int = 1,
         margin: float = 0.0,
         arm_margin: float = 0.0,
+        departure: Sequence[GaussianCollisionField] = (),
+        unknown: GaussianCollisionField | None = None,
         moving: Array | None = None,
     ) -> None:
         if observers is not None and observers.shape != (len(scene.model), 3):
@@ -76,6 +82,7 @@ class GraspSampler:
         self.raw = raw
         self.hand = hand_of(robot)
         self.margin, self.arm_margin, self.n_sigma = margin, arm_margin, n_sigma
+        self.departure, self.unknown = tuple(departure), unknown
         self.moving = None if moving is None or not len(moving) else np.asarray(moving, dtype=np.float64)
         self.min_observations = min_observations
         self.field = self.collision_field(scene.model)
@@ -124,5 +131,13 @@ class GraspSampler:
         return self._make_reach(*fields)
 
     def _arm_reach(self, around: GaussianCollisionField, whole: GaussianCollisionField) -> ReachabilityCheck:
-        base = self.scene.T_world_base
-        return ArmReach(self.robot, base, around, whole, margin=self.margin, arm_margin=self.arm_margin)
+        return ArmReach(
+            self.robot,
+            self.scene.T_world_base,
+            around,
+            whole,
+            margin=self.margin,
+            arm_margin=self.arm_margin,
+            departure=self.departure,
+            unknown=self.unknown,
+        )
