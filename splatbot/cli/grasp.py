@@ -17,10 +17,12 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from splatbot.collision.unknown import UnknownPolicy
     from splatbot.grasping.affordance import Hint, ObservedView, Target
     from splatbot.grasping.sampler import GraspSampler
     from splatbot.grasping.types import GraspResult
     from splatbot.robots.graspable_objects import GraspableObjects
+    from splatbot.robots.robot import RobotModel
 
 
 def grasp(
@@ -45,6 +47,7 @@ def grasp(
     wanted: int = 10,
     pregrasp: float = 0.10,
     margin: Annotated[str | None, tyro.conf.arg(metavar="M|auto")] = None,
+    unknown: Literal["free", "cautious", "occupied"] = "free",
     n_sigma: float = 1.0,
     min_observations: int = 1,
     seed: int = 0,
@@ -89,6 +92,8 @@ def grasp(
         margin: clearance [m] of hand and arm to the rest of the map. "auto", the default with a run, is the audited
             error of the map around the target, for the arm alone: the hand has to come close, and is checked against
             raw depth.
+        unknown: space that no frame of the run saw to be empty, as in `splatbot plan`. Arm and hand avoid it at the
+            pre-grasp, and the arm on the approach; --accept-implied decides on fingers there.
         n_sigma: surface of a Gaussian, in standard deviations; smaller than for planning, because the hand comes close.
         min_observations: least number of keyframes that support a Gaussian; others are ignored.
         seed: seed of the search.
@@ -136,6 +141,8 @@ def grasp(
     found = find_target(hint, scene, [*name_backends(vlm=vlm), SpatialAffordance(), TagAffordance()])
     sampler = objects.sampler(arm, hand_only=hand_only, n_sigma=n_sigma, min_observations=min_observations)
     margin_text = _set_margin(sampler, "0" if hand_only and margin is None else margin, map, found)
+    if not hand_only:
+        _agree_with_plans(sampler, map, arm, unknown)
     result = objects.with_notes(sampler.sample(found, options))
     folder = out if out is not None else Path("runs") / "grasp"
     folder.mkdir(parents=True, exist_ok=True)
@@ -145,6 +152,7 @@ def grasp(
             "T_world_base": pose_values(scene.T_world_base),
             "margin_m": sampler.margin,
             "arm_margin_m": max(sampler.margin, sampler.arm_margin),
+            "unknown_space": unknown,
         }
         handle.write(json.dumps(summary(result) | placed, indent=2).encode())
     shown = next(iter((*result.grasps, *result.doubtful)), result.best_rejected)
@@ -159,7 +167,7 @@ def grasp(
     result.unwrap()
     _print(result, folder, margin_text, verbose=verbose)
     if not hand_only:
-        on = f"--map {map} --robot {robot}{base_words(base)}"
+        on = f"--map {map} --robot {robot}{base_words(base)}{'' if unknown == 'free' else f' --unknown {unknown}'}"
         print_text(f"next: splatbot plan {on} --start home --grasp {folder / 'grasp.json'}")
     return 0
 
@@ -269,6 +277,28 @@ def _set_margin(sampler: GraspSampler, margin: str | None, map_: Path, target: T
     if sampler.margin > 0.0:
         return f"{1e3 * sampler.margin:.1f} mm for arm and hand; {hand}"
     return f"0, so that errors of the map are not covered; {hand}"
+
+
+def _agree_with_plans(sampler: GraspSampler, map_: Path, arm: RobotModel, policy: UnknownPolicy) -> None:
+    """Limit the pre-grasps to ends of plans from home.
+
+    Raises:
+        InputError: the policy needs a run.
+        FormatError: the run is damaged.
+        LogError: its log is damaged.
+    """
+    from splatbot.collision import GaussianCollisionField, RobotSpheres
+    from splatbot.gaussians import GaussianModel
+    from splatbot.results.unknown import field_of, unknown_in_reach
+    from splatbot.robots.in_view import reopen_log
+
+    solids = None
+    if policy != "free":
+        run = run_folder(map_, "--unknown")
+        spheres = RobotSpheres(arm, T_world_base=sampler.scene.T_world_base)
+        space = unknown_in_reach(run, reopen_log(run), spheres)
+        solids = field_of(space, policy, spheres, arm.home, margin=max(sampler.margin, sampler.arm_margin))
+    sampler.agree_with_plans(GaussianCollisionField(GaussianModel.load(map_file(map_))), solids)
 
 
 def _print(result: GraspResult, folder: Path, margin: str, *, verbose: bool) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal
@@ -142,20 +142,35 @@ def find_unknown(aabb: ArrayLike, voxel: float, views: Iterable[DepthView]) -> U
             f"is {low.tolist()}..{high.tolist()} in {voxel} m.", field="aabb", hint="give low < high, voxel > 0"
         )
     size = np.ceil((high - low) / voxel - 1e-9).astype(np.int64)
-    cells = np.moveaxis(np.indices(tuple(size.tolist())), 0, -1).reshape(-1, 3)
-    centers, radius = cells * voxel + low + voxel / 2, np.sqrt(3) / 2 * voxel
-    blocks = -(-size // CONSTANTS.block)
-    block_of = np.ravel_multi_index(tuple((cells // CONSTANTS.block).T), tuple(blocks))
-    of_block = np.moveaxis(np.indices(tuple(blocks.tolist())), 0, -1).reshape(-1, 3)
-    block_centers = (of_block + 0.5) * (CONSTANTS.block * voxel) + low
-    unknown, missing = np.ones(len(centers), np.bool_), np.zeros(len(centers), np.int32)
-    for view in views:
-        left = np.flatnonzero(unknown & _in_image(block_centers, CONSTANTS.block * radius, view)[block_of])
+    radius, views = np.sqrt(3) / 2 * voxel, list(views)
+    corners, in_image = _blocks(low, size, voxel, views)
+    cells = (corners[:, None] + np.moveaxis(np.indices((CONSTANTS.block,) * 3), 0, -1).reshape(1, -1, 3)).reshape(-1, 3)
+    block_of = np.repeat(np.arange(len(corners)), CONSTANTS.block**3)
+    inside = (cells < size).all(axis=1)
+    cells, block_of = cells[inside], block_of[inside]
+    centers = cells * voxel + low + voxel / 2
+    open_, missing = np.zeros(len(cells), np.bool_), np.zeros(len(cells), np.int32)
+    for view, met in zip(views, in_image, strict=True):
+        left = np.flatnonzero(~open_ & met[block_of])
         empty, lacks_depth = _observed(centers[left], radius, view)
-        unknown[left[empty]] = False
+        open_[left[empty]] = True
         missing[left[lacks_depth]] += 1
-    suspect = unknown & (missing >= CONSTANTS.suspect_views)
-    return UnknownSpace(unknown.reshape(*size), suspect.reshape(*size), low, float(voxel))
+    unknown, suspect = np.ones(tuple(size), np.bool_), np.zeros(tuple(size), np.bool_)
+    unknown[tuple(cells.T)] = ~open_
+    suspect[tuple(cells.T)] = ~open_ & (missing >= CONSTANTS.suspect_views)
+    return UnknownSpace(unknown, suspect, low, float(voxel))
+
+
+def _blocks(
+    low: Array, size: NDArray[np.int64], voxel: float, views: Sequence[DepthView]
+) -> tuple[NDArray[np.int64], list[NDArray[np.bool_]]]:
+    """Return the first cells (B, 3) of the blocks of voxels that any view shows, and which (B,) of them each shows."""
+    blocks = -(-size // CONSTANTS.block)
+    corners = np.moveaxis(np.indices(tuple(blocks.tolist())), 0, -1).reshape(-1, 3) * CONSTANTS.block
+    edge = CONSTANTS.block * voxel
+    in_image = [_in_image(corners * voxel + low + edge / 2, np.sqrt(3) / 2 * edge, view) for view in views]
+    shown = np.any(in_image, axis=0) if in_image else np.zeros(len(corners), np.bool_)
+    return corners[shown], [met[shown] for met in in_image]
 
 
 def _in_image(centers: Array, radius: float, view: DepthView) -> NDArray[np.bool_]:

@@ -45,10 +45,6 @@ class GraspSampler:
         margin: clearance that arm and hand keep from the map [m].
         arm_margin: the same for the links before the hand alone [m]. The hand has to come close, and is checked
             against raw depth.
-        departure: fields that a plan to a pre-grasp avoids, as the map at the size of a plan's Gaussians; see
-            :class:`splatbot.grasping.reach.ArmReach`.
-        unknown: field of unknown space, which the links before the hand avoid on the approach. Unseen space between
-            the fingers is judged by ``raw``.
         moving: (V, 4) balls (x, y, z, radius) [m, world] of regions where motion was observed; see
             :func:`splatbot.collision.find_moving`. Grasps that avoid them score higher.
 
@@ -70,8 +66,6 @@ class GraspSampler:
         min_observations: int = 1,
         margin: float = 0.0,
         arm_margin: float = 0.0,
-        departure: Sequence[GaussianCollisionField] = (),
-        unknown: GaussianCollisionField | None = None,
         moving: Array | None = None,
     ) -> None:
         if observers is not None and observers.shape != (len(scene.model), 3):
@@ -82,11 +76,22 @@ class GraspSampler:
         self.raw = raw
         self.hand = hand_of(robot)
         self.margin, self.arm_margin, self.n_sigma = margin, arm_margin, n_sigma
-        self.departure, self.unknown = tuple(departure), unknown
+        self.departure: tuple[GaussianCollisionField, ...] = ()
+        self.unknown: GaussianCollisionField | None = None
         self.moving = None if moving is None or not len(moving) else np.asarray(moving, dtype=np.float64)
         self.min_observations = min_observations
         self.field = self.collision_field(scene.model)
         self._make_reach = None if hand_only else make_reach or self._arm_reach
+
+    def agree_with_plans(self, field: GaussianCollisionField, unknown: GaussianCollisionField | None = None) -> None:
+        """Offer only grasps whose pre-grasp a plan may end at.
+
+        Args:
+            field: collision field of the map for plans, whose Gaussians are larger than those of the grasps.
+            unknown: field of unknown space, which plans avoid. If None, it counts as free.
+        """
+        self.departure = (field,) if unknown is None else (field, unknown)
+        self.unknown = unknown
 
     def sample(self, target: Target, options: GraspOptions | None = None) -> GraspResult:
         """Sample ranked grasps of a target; a result without grasps holds the reasons.

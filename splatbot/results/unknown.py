@@ -29,7 +29,7 @@ class RunUnknownConstants:
     """
 
     voxel: float = 0.01
-    max_voxels: int = 1_500_000
+    max_voxels: int = 10_000_000
     samples: int = 500
 
 
@@ -70,6 +70,14 @@ def obstacles(
     q = np.atleast_2d(np.asarray(occupied, dtype=np.float64))
     centers, radii = arm.centers(q).reshape(-1, 3), np.tile(arm.spheres.radii + margin, len(q))
     return space.without(np.c_[centers, radii]).solids(policy=policy)
+
+
+def field_of(
+    space: UnknownSpace, policy: UnknownPolicy, arm: RobotSpheres, start: ArrayLike, *, margin: float = 0.0
+) -> GaussianCollisionField | None:
+    """Return the field of :func:`obstacles` alone; None if there are none."""
+    solids = obstacles(space, policy, arm, start, margin=margin)
+    return GaussianCollisionField(solids) if len(solids) else None
 
 
 def with_unknown(
