@@ -251,6 +251,11 @@ class GraspsRequest(Request):
         description='clearance of hand and arm to the rest [m], or "auto": the audited error of the map around the '
         'target, for the arm alone. The default is "auto" where the map has a recording, else 0',
     )
+    unknown: Literal["free", "cautious", "occupied"] = Field(
+        "free",
+        description="space that no frame observed, as in a plan. Arm and hand avoid it at the pre-grasp, and the arm "
+        "on the approach",
+    )
     min_observations: Annotated[int, Field(ge=1, le=1000)] = Field(
         1, description="least number of keyframes of a Gaussian"
     )

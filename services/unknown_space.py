@@ -7,12 +7,13 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from splatbot.collision import GaussianCollisionField, RobotSpheres
+from splatbot.collision import GaussianCollisionField, RobotSpheres, UnknownSpace
 from splatbot.collision.unknown import UnknownPolicy
 from splatbot.errors import InputError
-from splatbot.results.unknown import unknown_in_reach, with_unknown
+from splatbot.results.unknown import field_of, unknown_in_reach, with_unknown
 from splatbot.robots.in_view import reopen_log
 from splatbot.robots.robot import RobotModel
+from splatbot.services.schemas import Pose
 from splatbot.services.store import ServedMap
 
 
@@ -40,6 +41,40 @@ def field_with_unknown(
     field = served.field
     if policy == "free":
         return lambda margin: field
+    arm = RobotSpheres(robot, T_world_base=T_world_base)
+    return with_unknown(field, served.ready.model, _space(served, arm), policy, arm, start)
+
+
+def unknown_field(
+    served: ServedMap,
+    policy: UnknownPolicy,
+    robot: RobotModel,
+    T_world_base: NDArray[np.float64],
+    *,
+    margin: float,
+) -> GaussianCollisionField | None:
+    """Return the field of unknown space alone, for an arm that is at home; None if it is free.
+
+    For arguments and errors see :func:`field_with_unknown`.
+    """
+    if policy == "free":
+        return None
+    arm = RobotSpheres(robot, T_world_base=T_world_base)
+    return field_of(_space(served, arm), policy, arm, robot.home, margin=margin)
+
+
+def refuse_other_bases(policy: UnknownPolicy, given: Pose | None) -> None:
+    """Check that a request with unknown space is for the base of the map.
+
+    Raises:
+        InputError: it gives its own base, which would make each request a search of seconds.
+    """
+    if policy != "free" and given is not None:
+        hint = "write the base into the scene.yaml of the map, or leave unknown space free"
+        raise InputError("is given, but unknown space is known for the base of the map.", field="base", hint=hint)
+
+
+def _space(served: ServedMap, arm: RobotSpheres) -> UnknownSpace:
     run = served.run
     if run is None:
         raise InputError(
@@ -47,6 +82,4 @@ def field_with_unknown(
             field="unknown",
             hint='give "free", or map a recording',
         )
-    arm = RobotSpheres(robot, T_world_base=T_world_base)
-    space = served.derived.get(("unknown space", robot.name), lambda: unknown_in_reach(run, reopen_log(run), arm))
-    return with_unknown(field, served.ready.model, space, policy, arm, start)
+    return served.derived.get(("unknown space", arm.robot.name), lambda: unknown_in_reach(run, reopen_log(run), arm))

@@ -22,6 +22,7 @@ from splatbot.services.margins import MarginSource, margin_source
 from splatbot.services.robots_in_maps import base_in, objects_in
 from splatbot.services.schemas import GraspsRequest
 from splatbot.services.topics import GRASPS
+from splatbot.services.unknown_space import refuse_other_bases, unknown_field
 
 router = APIRouter(prefix="/v1/maps", tags=["grasping"])
 
@@ -43,6 +44,7 @@ _ANSWER = {
     "margin_m": 0.0,
     "arm_margin_m": 0.006,
     "margin_source": "audited error of the map where the arm moves",
+    "unknown_space": "free",
 }
 _Body = Annotated[GraspsRequest, Depends(body_of(GraspsRequest))]
 
@@ -59,6 +61,7 @@ def grasps(request: Request, served: ServedAfterFrames, service: Service, query:
     Words match names, colours, shapes, sizes and places; an ambiguous description is refused.
     """
     robot, base = known_robot(query.robot), base_in(served, query.base)
+    refuse_other_bases(query.unknown, query.base)
     objects = objects_in(served, base, as_known=query.base is None)
     found = find_target(_hint(query), objects.scene, [LanguageAffordance(), SpatialAffordance()])
     sampler = objects.sampler(robot, hand_only=query.hand_only, min_observations=query.min_observations)
@@ -68,6 +71,9 @@ def grasps(request: Request, served: ServedAfterFrames, service: Service, query:
     if source.error is not None:
         means = objects.scene.model.means.detach().double().numpy()
         sampler.arm_margin = source.error.in_region(means[found.rows]).quantile(MARGIN.confidence)
+    if not query.hand_only:
+        most = max(sampler.margin, sampler.arm_margin)
+        sampler.agree_with_plans(served.field, unknown_field(served, query.unknown, robot, base, margin=most))
     options = GraspOptions(
         friction=query.friction,
         samples=query.samples,
@@ -84,6 +90,7 @@ def grasps(request: Request, served: ServedAfterFrames, service: Service, query:
         "margin_m": sampler.margin,
         "arm_margin_m": max(sampler.margin, sampler.arm_margin),
         "margin_source": source.why,
+        "unknown_space": query.unknown,
     }
     return answer(request, summary(result) | said | {"map_version": served.map_version})
 

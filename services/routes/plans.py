@@ -7,7 +7,6 @@ from typing import Annotated, Any
 import numpy as np
 from fastapi import APIRouter, Depends, Path, Request, Response
 
-from splatbot.errors import InputError
 from splatbot.geometry import inverse
 from splatbot.planning import GaussianRRTStar, JointGoal, PoseGoal
 from splatbot.planning.ik import solve_ik
@@ -21,7 +20,7 @@ from splatbot.services.problems import TooLargeError
 from splatbot.services.robots_in_maps import arm_in, base_in, joints_of
 from splatbot.services.schemas import BASE_EXAMPLE, IkRequest, PlanRequest
 from splatbot.services.topics import PLAN
-from splatbot.services.unknown_space import field_with_unknown
+from splatbot.services.unknown_space import field_with_unknown, refuse_other_bases
 
 router = APIRouter(tags=["motion"])
 
@@ -76,9 +75,7 @@ def plan(request: Request, served: ServedAfterFrames, service: Service, query: _
         if query.goal_pose is not None
         else JointGoal(joints_of(robot, query.goal or [], "goal"))
     )
-    if query.unknown != "free" and query.base is not None:
-        hint = "write the base into the scene.yaml of the map, or leave unknown space free"
-        raise InputError("is given, but unknown space is known for the base of the map.", field="base", hint=hint)
+    refuse_other_bases(query.unknown, query.base)
     source = margin_source(served, query.margin)
     field_at = field_with_unknown(served, query.unknown, robot, base, start)
     found = plan_with_margin(

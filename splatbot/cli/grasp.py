@@ -112,6 +112,7 @@ def grasp(
 
     from splatbot.atomic import atomic_write
     from splatbot.cli.affordances import name_backends
+    from splatbot.cli.progress import steps
     from splatbot.cli.tables import print_text
     from splatbot.grasping.advice import first_change
     from splatbot.grasping.affordance import find_target
@@ -135,15 +136,20 @@ def grasp(
         seed=seed,
     )
     arm = load_robot(robot)
-    objects = graspable_objects(map, base)
-    scene = objects.scene
-    hint = _hint(map, index, target=target, pixel=pixel, point=point, box=box, mask=mask, tag=tag)
-    found = find_target(hint, scene, [*name_backends(vlm=vlm), SpatialAffordance(), TagAffordance()])
-    sampler = objects.sampler(arm, hand_only=hand_only, n_sigma=n_sigma, min_observations=min_observations)
-    margin_text = _set_margin(sampler, "0" if hand_only and margin is None else margin, map, found)
-    if not hand_only:
-        _agree_with_plans(sampler, map, arm, unknown)
-    result = objects.with_notes(sampler.sample(found, options))
+    with steps() as tell:
+        tell("segmenting the objects of the map")
+        objects = graspable_objects(map, base)
+        scene = objects.scene
+        hint = _hint(map, index, target=target, pixel=pixel, point=point, box=box, mask=mask, tag=tag)
+        found = find_target(hint, scene, [*name_backends(vlm=vlm), SpatialAffordance(), TagAffordance()])
+        sampler = objects.sampler(arm, hand_only=hand_only, n_sigma=n_sigma, min_observations=min_observations)
+        tell("auditing the error of the map")
+        margin_text = _set_margin(sampler, "0" if hand_only and margin is None else margin, map, found)
+        if not hand_only:
+            tell("searching for unknown space")
+            _agree_with_plans(sampler, map, arm, unknown)
+        tell(f"searching for grasps of {found.label}")
+        result = objects.with_notes(sampler.sample(found, options))
     folder = out if out is not None else Path("runs") / "grasp"
     folder.mkdir(parents=True, exist_ok=True)
     with atomic_write(folder / "grasp.json") as handle:

@@ -92,6 +92,7 @@ def plan(
     import numpy as np
 
     from splatbot.atomic import replace_files, write_bytes, write_text
+    from splatbot.cli.progress import steps
     from splatbot.cli.tables import print_text
     from splatbot.collision import GaussianCollisionField, RobotSpheres
     from splatbot.gaussians import GaussianModel
@@ -112,18 +113,23 @@ def plan(
         wanted = _pregrasp(grasp, grasp_index, arm, T_world_base)
     else:
         wanted = _joints(goal or (), arm, "--goal")
-    of_map = GaussianCollisionField(model, n_sigma)
-    field_at = _field_with_unknown(map, of_map, model, unknown, RobotSpheres(arm, T_world_base=T_world_base), here)
-    found = _plan(
-        map,
-        of_map,
-        lambda keep: GaussianRRTStar(field_at(keep), arm, T_world_base=T_world_base, margin=keep),
-        lambda planner: planner.plan(here, wanted, budget_ms=budget_ms, seed=seed),
-        here if goal_pose is not None else np.stack([here, wanted]),
-        margin="auto" if margin is None and map.is_dir() else margin or "0",
-        confidence=confidence,
-        speed=speed,
-    )
+    with steps() as tell:
+        tell("loading the map")
+        of_map = GaussianCollisionField(model, n_sigma)
+        if unknown != "free":
+            tell("searching for unknown space")
+        field_at = _field_with_unknown(map, of_map, model, unknown, RobotSpheres(arm, T_world_base=T_world_base), here)
+        found = _plan(
+            map,
+            of_map,
+            lambda keep: GaussianRRTStar(field_at(keep), arm, T_world_base=T_world_base, margin=keep),
+            lambda planner: planner.plan(here, wanted, budget_ms=budget_ms, seed=seed),
+            here if goal_pose is not None else np.stack([here, wanted]),
+            margin="auto" if margin is None and map.is_dir() else margin or "0",
+            confidence=confidence,
+            speed=speed,
+            tell=tell,
+        )
     result, trajectory = found.result, found.trajectory
     refuse_unknown(result, len(model), unknown)
     result.unwrap()
@@ -176,6 +182,7 @@ def _plan(
     margin: str,
     confidence: float,
     speed: float,
+    tell: Callable[[str], None],
 ) -> RegionPlan:
     """Plan with a given margin, or with the audited margin of the region."""
     from splatbot.results.margin import audited_error
@@ -183,8 +190,11 @@ def _plan(
     from splatbot.robots.in_view import reopen_log
 
     if margin == "auto":
+        tell("auditing the error of the map")
         error = audited_error(map_, reopen_log(run_folder(map_, "--margin auto")), of_map)
+        tell("planning with the error of the region as margin")
         return plan_in_region(make_planner, plan_once, ends, error, confidence=confidence, speed=speed)
+    tell("planning")
     return plan_at_margin(make_planner(margin_value(margin)), plan_once, speed=speed)
 
 

@@ -63,6 +63,18 @@ def shares(quiet: bool) -> Iterator[Callable[[str, float], None]]:
         yield lambda what, share: bars.update(task, description=what, completed=share)
 
 
+@contextmanager
+def steps(quiet: bool = False) -> Iterator[Callable[[str], None]]:
+    """Yield a callback that shows the current step of a command of some seconds on a terminal."""
+    if quiet or not sys.stderr.isatty():
+        yield lambda what: None
+        return
+    from rich.console import Console
+
+    with Console(stderr=True).status("") as status:
+        yield lambda what: status.update(f"{what} ...")
+
+
 class PlainLines:
     """Writes a line when two seconds have passed, a phase begins, or a frame is lost or unreadable."""
 

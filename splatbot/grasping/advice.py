@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from splatbot.grasping.object_list import obstacle
-from splatbot.grasping.types import GraspResult
+from splatbot.grasping.types import FITTING, GraspResult
 from splatbot.segmentation import SegmentedMap
 
 _CHANGES = (
@@ -77,7 +77,8 @@ def first_change(result: GraspResult, scene: SegmentedMap, stroke: float) -> tup
         size = obstacle(scene.objects[number], stroke)
         if size is not None:
             return size.reason, "take a hand that opens wider (`splatbot robot list`), or another target"
-    ranked = sorted(result.rejected.items(), key=lambda pair: -pair[1])
+    # Hands that only the arm rejects fit the object: that reason comes first, however few they are.
+    ranked = sorted(result.rejected.items(), key=lambda pair: (not pair[0].startswith(FITTING), -pair[1]))
     for reason, count in ranked:
         for words, why, change in _CHANGES:
             if count and words in reason:

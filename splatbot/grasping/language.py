@@ -133,10 +133,11 @@ class LanguageAffordance(OneKindAffordance[NameHint]):
 def _named(scene: SegmentedMap, text: str) -> Target | None:
     """Return the object with this name or alias in the scene file; None if no entry has it."""
     plain = " ".join(word for word in text.split() if word not in _STOP_WORDS)
-    listed = re.fullmatch(r"object (\d+)", plain)
-    if listed and int(listed[1]) < len(scene.objects):
-        item = scene.objects[int(listed[1])]
-        return Target(item.rows, None, item.name or plain, "list", 1.0, (), item.number)
+    numbered = re.fullmatch(r"(.+) (\d+)", plain)
+    if numbered and int(numbered[2]) < len(scene.objects):
+        item = scene.objects[int(numbered[2])]
+        if plain in (f"object {item.number}", label_of(scene, item)):
+            return Target(item.rows, None, item.name or plain, "list", 1.0, (), item.number)
     for entry in scene.names:
         if plain in (other.lower() for other in (entry.name, *entry.aliases)):
             found = next((o for o in scene.objects if o.name == entry.name), None)
@@ -186,6 +187,11 @@ def shape_name(scene: SegmentedMap, item: MapObject) -> str:
     return max(SHAPES, key=lambda kind: _shape_score(scene, item, kind))
 
 
+def label_of(scene: SegmentedMap, item: MapObject) -> str:
+    """Return the name of an object in the scene file, else its colour, shape and number, which names it as a target."""
+    return item.name or f"{color_name(item)} {shape_name(scene, item)} {item.number}"
+
+
 def _described(item: MapObject) -> str:
     """Describe an object by its name, the nearest colour name and its size."""
     color = color_name(item)
@@ -217,7 +223,7 @@ def _scores(attributes: _ObjectAttributes, text: str) -> tuple[Array, tuple[str,
         rule = _rule(word)
         if rule is None:
             known = ", ".join((*COLORS, *(w for words in SHAPES.values() for w in words), *SIZES, *RELATIONS))
-            ways = "name it in scene.yaml, point at it, write 'object N' as `splatbot objects` numbers it, or use"
+            ways = "name it in scene.yaml, point at it, write a label of `splatbot objects`, or use"
             raise AffordanceError(
                 f"has {raw!r}, which is neither a name of the scene nor in the vocabulary.",
                 field=text.strip() or raw,

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ import numpy as np
 from splatbot.geometry import inverse, transform_points
 from splatbot.grasping.hands import CONSTANTS as HANDS
 from splatbot.grasping.hands import usable_opening
-from splatbot.grasping.language import color_name, shape_name
+from splatbot.grasping.language import label_of
 from splatbot.protocols import Array, HasHand, RobotKinematics
 from splatbot.segmentation import MapObject, SegmentedMap
 from splatbot.segmentation.plane import NEAR
@@ -53,7 +52,7 @@ class ListedObject:
 
     Args:
         number: index; ``object NUMBER`` names it as a target.
-        label: name of the scene file, or colour and shape; followed by a number if several have it.
+        label: name of the scene file, or colour, shape and number. It names this object as a target.
         size: (3,) long side, short side and height [m].
         at_world, at_base: (3,) centre of the bounding box [m].
         gaussians: number of Gaussians.
@@ -106,7 +105,7 @@ def list_objects(scene: SegmentedMap, robot: RobotKinematics) -> tuple[ListedObj
         found.append(
             ListedObject(
                 item.number,
-                item.name or f"{color_name(item)} {shape_name(scene, item)}",
+                label_of(scene, item),
                 item.size,
                 item.center,
                 at,
@@ -117,8 +116,7 @@ def list_objects(scene: SegmentedMap, robot: RobotKinematics) -> tuple[ListedObj
                 obstacle=limit.reason if limit else "",
             )
         )
-    several = {label for label, count in Counter(o.label for o in found).items() if count > 1}
-    return tuple(replace(o, label=f"{o.label} {o.number}") if o.label in several else o for o in found)
+    return tuple(found)
 
 
 def list_planes(scene: SegmentedMap) -> list[dict[str, Any]]:

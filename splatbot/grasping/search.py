@@ -25,7 +25,7 @@ from splatbot.grasping.options import GraspOptions
 from splatbot.grasping.reach import ReachabilityCheck
 from splatbot.grasping.score import ZERO_SCORE_DISTANCE_M, arm_terms, hand_terms, suppress_similar, totals
 from splatbot.grasping.sweep import finger_clearance, swept_clearance, touches
-from splatbot.grasping.types import Grasp, GraspResult
+from splatbot.grasping.types import FITTING, Grasp, GraspResult
 from splatbot.grasping.volume import enclosed_volume
 from splatbot.planning.cartesian import along
 from splatbot.protocols import Array
@@ -328,7 +328,7 @@ class Search:
         checked = self._checked(left, reach, self.o.wanted - len(found))
         blocked = [(grasp, kind) for grasp, kind in checked if grasp.rejected]
         for _, kind in blocked:
-            self.log.drop(f"hands: {kind}", 1)
+            self.log.drop(FITTING + kind, 1)
         if blocked:
             self.log.best = blocked[0][0]
         found += [grasp for grasp, _ in checked if not grasp.rejected]

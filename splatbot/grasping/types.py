@@ -13,6 +13,9 @@ from splatbot.grasping.measured import CONSTANTS, blind
 from splatbot.grasping.score import confidence
 from splatbot.protocols import Array
 
+FITTING = "hands: "
+"""Prefix of the reasons for which hands that fit the target are rejected by the arm or by all measured depth."""
+
 
 @dataclass(frozen=True, eq=False)
 class Grasp:

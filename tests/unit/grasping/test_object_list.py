@@ -20,6 +20,9 @@ def test_each_object_of_the_list_can_be_named_as_a_target() -> None:
     found = list_objects(scene(), panda())
     assert len({item.label for item in found}) == len(found) == len(scene().objects)
     for item in found:
+        target = LanguageAffordance().locate(NameHint(item.label), scene())
+        assert (target.number, target.score) == (item.number, 1.0)
+    for item in found:
         target = LanguageAffordance().locate(NameHint(f"object {item.number}"), scene())
         assert target.number == item.number
         assert item.to_dict()["target"] == f"object {item.number}"

@@ -232,6 +232,33 @@ def test_the_links_before_the_hand_keep_the_margin_of_the_arm_while_the_hand_com
         ArmReach(panda(), np.eye(4), around, arm_margin=-1.0)
 
 
+def test_a_pregrasp_is_where_a_plan_may_end_and_the_arm_stays_out_of_unknown_space() -> None:
+    target, few, margin = target_of(scene(), BOX, "box"), GraspOptions(samples=100), 0.01
+    first = GraspSampler(scene(), panda()).sample(target, few).grasps[0]
+    center, radius = first.T_world_pregrasp[:3, 3] - 0.05 * first.T_world_pregrasp[:3, 2], 0.04
+    ball = GaussianModel.from_activated(
+        means=center[None], quats=[[1, 0, 0, 0]], scales=np.full((1, 3), radius / 2), opacities=[0.9], colors=[[0, 0, 0]]
+    )
+    sampler = GraspSampler(scene(), panda(), arm_margin=margin)
+    plans = GaussianCollisionField(scene().model, 2.0)
+    sampler.agree_with_plans(plans, GaussianCollisionField(ball, 2.0))
+    result = sampler.sample(target, few)
+    assert result.grasps
+    assert result.rejected["hands: start where no plan may end"] > 0
+    open_, links = panda().spheres(), panda().spheres().link < 7
+    for g in result.grasps:
+        assert g.approach_path is not None
+        for k, q in enumerate(g.approach_path):
+            placed = (scene().T_world_base @ panda().fk(q[None])[0])[open_.link]
+            at = np.einsum("sij,sj->si", placed[:, :3, :3], open_.centers) + placed[:, :3, 3]
+            gap = np.linalg.norm(at - center, axis=1) - open_.radii - radius
+            assert gap[links].min() > margin - 1e-6
+            if k == 0:
+                moving = open_.link > 0  # the base stands on the table
+                assert gap.min() > margin - 1e-6
+                assert (plans.clearance(at[moving], cut=0.2).distance - open_.radii[moving]).min() > margin - 1e-6
+
+
 INNER, OUTER, HIGH, RIM = 0.021, 0.0325, 0.016, 0.0055  # [m] of a low ring
 
 
