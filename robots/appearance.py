@@ -23,6 +23,7 @@ from splatbot.errors import FormatError
 from splatbot.geometry import transform_points
 from splatbot.protocols import Array
 from splatbot.report.robot_drawing import Color, DrawnPart
+from splatbot.robots.hand_appearance import hand_parts
 from splatbot.robots.maker_meshes import Source
 from splatbot.robots.panda import T_LINK_HAND, panda
 from splatbot.robots.robot import RobotModel
@@ -40,6 +41,10 @@ def appearance(robot: RobotModel, opening: float | None = None) -> list[DrawnPar
         FormatError: the stored meshes are damaged.
     """
     parts, fingers = links_and_finger(robot)
+    hand = hand_parts(robot, opening)
+    if hand is not None:
+        arm = [part for part in parts if part.link < len(robot)]
+        return [*arm, *_wrist(robot), *hand]
     return parts + [part for piece in fingers for part in _fingers(robot, piece.triangles, piece.color, opening)]
 
 
@@ -72,6 +77,13 @@ def links_and_finger(robot: RobotModel) -> tuple[list[DrawnPart], list[DrawnPart
         if link not in drawn
     ]
     return parts + balls, fingers
+
+
+def _wrist(robot: RobotModel) -> list[DrawnPart]:
+    """Return the meshes of the last link without its hand."""
+    if _has_panda_arm(robot):
+        return [replace(piece, link=len(robot)) for piece in _panda_meshes().get(f"link{len(robot)}", ())]
+    return [DrawnPart(mesh.link, mesh.triangles(), _LIGHT) for mesh in robot.visual if mesh.link == len(robot)]
 
 
 def coarse_appearance(robot: RobotModel, most: int = 250) -> list[DrawnPart]:

@@ -64,6 +64,44 @@ def sweep(reader: UrdfReader) -> SweptHand:
     Raises:
         FormatError: several joints are driven, or there are not two fingers that keep their direction.
     """
+    links = pose_links(reader)
+    at, corners, fingers = links.at, links.corners, links.fingers
+    ours = [_placed(at[link], corners[link]) for link, side in fingers.items() if side > 0]  # (N, V, 3)
+    face = np.min([points[..., 1].min(axis=1) for points in ours], axis=0)
+    finger = [hull for points in ours for hull in _hulls(points - face[:, None, None] * [0.0, 1.0, 0.0])]
+    body: list[Shape] = []
+    for link in corners:
+        if link not in fingers:
+            rests = np.abs(at[link] - at[link][0]).max() <= CONSTANTS.moved
+            shapes = reader.shapes(link, 0, at[link][0])
+            body += [named.shape for named in shapes] if rests else _hulls(_placed(at[link], corners[link]))
+    tip = np.max([points[..., 2].max(axis=1) for points in ours], axis=0)
+    return SweptHand(tuple(body), tuple(finger), links.opening, tip)
+
+
+@dataclass(frozen=True, eq=False)
+class PosedLinks:
+    """Links of a gripper at N positions of its driven joint, in the frame of :class:`SweptHand`.
+
+    Args:
+        at: (N, 4, 4) poses of each link.
+        corners: (V, 3) corners of the hull of each link that has geometry, in its own frame [m].
+        fingers: links that translate, with the sign of their side along y.
+        opening: (N,) distance between the pads [m].
+    """
+
+    at: Mapping[str, Array]
+    corners: Mapping[str, Array]
+    fingers: Mapping[str, float]
+    opening: Array
+
+
+def pose_links(reader: UrdfReader) -> PosedLinks:
+    """Compute the poses of all links of a gripper with one driven joint; see :func:`sweep`.
+
+    Raises:
+        FormatError: several joints are driven, or there are not two fingers that keep their direction.
+    """
     at = _positions(reader)
     corners = {link: _corners(reader.shapes(link, 0, np.eye(4))) for link in at}
     corners = {link: points for link, points in corners.items() if len(points)}
@@ -84,15 +122,7 @@ def sweep(reader: UrdfReader) -> SweptHand:
     face = np.min([points[..., 1].min(axis=1) for points in ours], axis=0)
     theirs = [_placed(at[link], corners[link]) for link in fingers if sides[link] < 0]
     other = np.max([points[..., 1].max(axis=1) for points in theirs], axis=0)
-    finger = [hull for points in ours for hull in _hulls(points - face[:, None, None] * [0.0, 1.0, 0.0])]
-    body: list[Shape] = []
-    for link in corners:
-        if link not in fingers:
-            rests = np.abs(at[link] - at[link][0]).max() <= CONSTANTS.moved
-            shapes = reader.shapes(link, 0, at[link][0])
-            body += [named.shape for named in shapes] if rests else _hulls(_placed(at[link], corners[link]))
-    tip = np.max([points[..., 2].max(axis=1) for points in ours], axis=0)
-    return SweptHand(tuple(body), tuple(finger), face - other, tip)
+    return PosedLinks(at, corners, sides, face - other)
 
 
 def _positions(reader: UrdfReader) -> Mapping[str, Array]:

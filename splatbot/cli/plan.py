@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from splatbot.collision.unknown import UnknownPolicy
     from splatbot.gaussians import GaussianModel
     from splatbot.planning import GaussianRRTStar, JointTrajectory, PlanResult
+    from splatbot.planning.closest import ClosestApproach
     from splatbot.results.region_plan import RegionPlan
     from splatbot.robots.robot import RobotModel
 
@@ -97,6 +98,7 @@ def plan(
     from splatbot.collision import GaussianCollisionField, RobotSpheres
     from splatbot.gaussians import GaussianModel
     from splatbot.planning import GaussianRRTStar, PoseGoal
+    from splatbot.planning.closest import closest_approach
     from splatbot.report.plan_page import plan_html, plan_png
     from splatbot.results.unknown import refuse_unknown
     from splatbot.robots.appearance import appearance, coarse_appearance
@@ -135,10 +137,15 @@ def plan(
     result.unwrap()
     assert trajectory is not None
     covers = found.scope(n_sigma=n_sigma, unknown=unknown, confidence=confidence)
+    nearest = closest_approach(found.planner.arm, found.planner.field, trajectory)
     folder = out if out is not None else Path("runs") / "plan"
     title = f"{arm.name} in {map.resolve().name}"
     texts = {
-        "plan.json": json.dumps(_summary(arm, T_world_base, result, trajectory) | {"covers": covers}, indent=2),
+        "plan.json": json.dumps(
+            _summary(arm, T_world_base, result, trajectory)
+            | {"nearest": None if nearest is None else nearest.to_dict(), "covers": covers},
+            indent=2,
+        ),
         "trajectory.json": trajectory.to_json(),
         "trajectory.csv": trajectory.to_csv(),
         "plan.html": plan_html(
@@ -146,9 +153,10 @@ def plan(
         ),
     }
     writers = {name: write_text(text) for name, text in texts.items()}
-    picture = plan_png(model, found.planner.arm, trajectory, appearance(arm), arm.fk)
+    of_arm = (appearance(arm), arm.fk, arm.T_link_tcp)
+    picture = plan_png(model, found.planner.arm, trajectory, *of_arm, nearest=nearest)
     replace_files(folder, writers | {"plan.png": write_bytes(picture)})
-    _print(result, trajectory, covers, folder)
+    _print(result, trajectory, covers, nearest, len(model), folder)
     next_ = f"splatbot twin --map {map} --robot {robot}{base_words(base)} --trajectory {folder / 'trajectory.json'}"
     print_text(f"next: {next_}")
     return 0
@@ -271,6 +279,7 @@ def _summary(
 
 
 _BASE_IN_MAP = "NOT COVERED, AND PROBABLY WRONG: more of the mounted link than its foot is in the map; check --base"
+_CLOSE = "less than 2 mm beyond the margin; a larger --margin keeps the arm farther away"
 _UNKNOWN = {
     "free": "not covered: counts as free",
     "cautious": "covered where two frames looked and measured no depth",
@@ -278,7 +287,14 @@ _UNKNOWN = {
 }
 
 
-def _print(result: PlanResult, trajectory: JointTrajectory, covers: dict[str, Any], folder: Path) -> None:
+def _print(
+    result: PlanResult,
+    trajectory: JointTrajectory,
+    covers: dict[str, Any],
+    nearest: ClosestApproach | None,
+    mapped: int,
+    folder: Path,
+) -> None:
     from splatbot.cli.tables import print_table
     from splatbot.planning.timing import clearance_text
 
@@ -290,6 +306,8 @@ def _print(result: PlanResult, trajectory: JointTrajectory, covers: dict[str, An
         ("duration", f"{trajectory.duration:.3f} s"),
         ("certified", "yes" if c.certified else "NO"),
         ("clearance", clearance_text(c)),
+        *([] if nearest is None else [("nearest", nearest.describe(mapped))]),
+        *([("close", _CLOSE)] if nearest is not None and nearest.close else []),
         ("covers", f"moving links against the map at {covers['n_sigma']:g} sigma and against the arm itself"),
         ("base", _BASE_IN_MAP if covers["base_in_map"] else "not covered: the mounted link is not checked"),
         (

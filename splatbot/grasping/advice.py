@@ -45,7 +45,7 @@ _CHANGES = (
     (
         "where no plan may end",
         "its pre-grasps are too near to the map or in unknown space",
-        "give another distance (--pregrasp 0.15), map the place from more sides, or let unknown space be free",
+        "start nearer (a smaller --pregrasp), map the place from more sides, or let unknown space be free",
     ),
     (
         "into unknown space",

@@ -23,6 +23,7 @@ class AnnotationConstants:
         dim: brightness of the picture behind a legend, relative to the picture.
         badge: [px] least distance between two numbers along an axis.
         turns: places around a centre that are tried for a number, from inside to outside.
+        ring: [px] radius of a ring.
         bars: [m] lengths of which a scale bar takes the largest that fills at most a fifth of the width.
     """
 
@@ -31,6 +32,7 @@ class AnnotationConstants:
     dim: float = 0.25
     badge: tuple[int, int] = (28, 20)
     turns: int = 2000
+    ring: int = 14
     bars: tuple[float, ...] = (1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01)
 
 
@@ -70,6 +72,15 @@ def with_scale(image: NDArray[np.float32], camera: Camera, depth: float, where: 
     corner[:] = (CONSTANTS.dim * corner).astype(np.uint8)
     cv2.rectangle(marked, (right - pixels, y - 1), (right, y + 1), _LIGHT, -1)
     cv2.putText(marked, text, (right - wide, y - 12), _FONT, CONSTANTS.font, _LIGHT, 1, cv2.LINE_AA)
+    return _floats(marked)
+
+
+def with_ring(image: NDArray[np.float32], place: tuple[float, float], color: Color) -> NDArray[np.float32]:
+    """Return an image (H, W, 3) in 0..1 with a ring around a place (u, v) [px], in front of everything."""
+    marked = _bytes(image)
+    center = (round(place[0]), round(place[1]))
+    for shade, width in ((_DARK, 6), (_shade(color), 3)):
+        cv2.circle(marked, center, CONSTANTS.ring, shade, width, cv2.LINE_AA)
     return _floats(marked)
 
 

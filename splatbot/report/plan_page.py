@@ -14,12 +14,14 @@ from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import inverse, look_at, transform_points
 from splatbot.planning import JointTrajectory
+from splatbot.planning.closest import ClosestApproach
 from splatbot.planning.timing import clearance_text
 from splatbot.protocols import Array
 from splatbot.rasterize.views import to_png
-from splatbot.report.annotations import with_legend, with_scale
+from splatbot.report.annotations import Color, with_legend, with_ring, with_scale
 from splatbot.report.moving_page import bytes_of, evenly_spaced, moving_page, packed
 from splatbot.report.robot_drawing import DrawnPart, draw_robot, map_view
+from splatbot.report.sphere_gaussians import sphere_gaussians
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,8 @@ CONSTANTS = PlanPageConstants()
 
 _START, _END = np.array([0.15, 0.45, 0.9]), np.array([0.95, 0.5, 0.1])  # tints of the ends
 _START_SHADE, _END_SHADE = (0.49, 0.67, 0.94), (0.97, 0.7, 0.46)  # as the shaded arms look
-_EYE, _TARGET = np.array([-0.9, 1.3, 1.2]), np.array([0.4, 0.0, 0.2])  # camera of the image, in the base frame [m]
+_FROM = np.array([-1.3, 1.3, 1.0])  # direction from the middle of the motion to the camera, in the base frame
+_NEAREST, _TOOL = (1.0, 0.15, 0.2), (0.2, 0.9, 0.95)
 
 
 def plan_html(
@@ -109,10 +112,14 @@ def plan_png(
     trajectory: JointTrajectory,
     parts: Sequence[DrawnPart],
     fk: Callable[[Array], Array],
+    T_link_tcp: Array,
     *,
+    nearest: ClosestApproach | None = None,
     width: int = 960,
 ) -> bytes:
     """Render the map with the arm at the start (blue), at the end (orange) and in between (transparent).
+
+    The camera shows the whole motion. Dots show the path of the tool, and a ring the nearest point of the map.
 
     Args:
         model: the map.
@@ -120,13 +127,28 @@ def plan_png(
         trajectory: the planned trajectory.
         parts: appearance of the robot.
         fk: returns the poses T_base_link (K, L, 4, 4) of its links at joint positions (K, J).
+        T_link_tcp: (4, 4) pose of the tool on the last link [m].
+        nearest: the moment at which the arm is nearest to the map. If None, it is not drawn.
         width: of the image [px]; the height is 3/4 of it.
     """
     times = np.linspace(0.0, trajectory.duration, CONSTANTS.ghosts)
     near = _within(model, inverse(arm.T_world_base))
     camera = Camera(0.9 * width, 0.9 * width, (width - 1) / 2, (width * 3 // 4 - 1) / 2, width, width * 3 // 4)
-    T_world_camera = arm.T_world_base @ look_at(_EYE, _TARGET)
-    view, depth = map_view(model.select(torch.from_numpy(near)), camera, T_world_camera)
+    moments = trajectory.at(np.linspace(0.0, trajectory.duration, CONSTANTS.frames)).position
+    swept = arm.centers(moments)
+    points = transform_points(inverse(arm.T_world_base), swept.reshape(-1, 3))
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    radius = float(np.linalg.norm(points - middle, axis=1).max())
+    away = radius / np.sin(np.arctan2(camera.height / 2, camera.fy)) + 1e-6
+    eye = middle + away * _FROM / np.linalg.norm(_FROM)
+    T_world_camera = arm.T_world_base @ look_at(eye, middle)
+    tool = (arm.T_world_base @ fk(moments)[:, -1] @ T_link_tcp)[:, :3, 3]
+    drawn = [model.select(torch.from_numpy(near)), _dots(tool, 0.004, _TOOL)]
+    legend = [("arm at the start", _START_SHADE), ("arm at the goal", _END_SHADE), ("path of the tool", _TOOL)]
+    if nearest is not None:
+        least = f"nearest to the map, {1e3 * nearest.clearance:.1f} mm beyond the margin"
+        legend.append((f"{least}, at {nearest.time:.1f} s", _NEAREST))
+    view, depth = map_view(GaussianModel.concatenate(drawn), camera, T_world_camera)
     links = arm.T_world_base @ fk(trajectory.at(times).position)
     last = CONSTANTS.ghosts - 1
     for k in (0, last, *range(1, last)):  # the ends first, because they hide and are hidden
@@ -141,9 +163,15 @@ def plan_png(
             tint=(1 - share) * _START + share * _END,
             opacity=1.0 if k in (0, last) else 0.3,
         )
-    view = with_legend(view, [("arm at the start", _START_SHADE), ("arm at the goal", _END_SHADE)])
-    away = float(np.linalg.norm(_EYE - _TARGET))
+    if nearest is not None:
+        x, y, z = transform_points(inverse(T_world_camera), nearest.point)
+        view = with_ring(view, (camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy), _NEAREST)
+    view = with_legend(view, legend)
     return to_png(with_scale(view, camera, away, "at the middle of the picture"), "rgb")
+
+
+def _dots(points: Array, radius: float, color: Color) -> GaussianModel:
+    return sphere_gaussians(points, np.full(len(points), radius), np.array(color), 0.95)
 
 
 def _within(model: GaussianModel, T_base_world: Array) -> NDArray[np.int64]:

@@ -237,7 +237,11 @@ def test_a_pregrasp_is_where_a_plan_may_end_and_the_arm_stays_out_of_unknown_spa
     first = GraspSampler(scene(), panda()).sample(target, few).grasps[0]
     center, radius = first.T_world_pregrasp[:3, 3] - 0.05 * first.T_world_pregrasp[:3, 2], 0.04
     ball = GaussianModel.from_activated(
-        means=center[None], quats=[[1, 0, 0, 0]], scales=np.full((1, 3), radius / 2), opacities=[0.9], colors=[[0, 0, 0]]
+        means=center[None],
+        quats=[[1, 0, 0, 0]],
+        scales=np.full((1, 3), radius / 2),
+        opacities=[0.9],
+        colors=[[0, 0, 0]],
     )
     sampler = GraspSampler(scene(), panda(), arm_margin=margin)
     plans = GaussianCollisionField(scene().model, 2.0)

@@ -1,0 +1,109 @@
+"""The place of a trajectory that is nearest to the map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from splatbot.collision import GaussianCollisionField, RobotSpheres
+from splatbot.geometry import inverse, transform_points
+from splatbot.planning.trajectory import JointTrajectory
+from splatbot.protocols import Array
+
+
+@dataclass(frozen=True)
+class ClosestConstants:
+    """Constants of the search for the nearest place.
+
+    Args:
+        moments: number of moments that are compared. The certificate, which is continuous, may be a little lower.
+        cut: [m] distance beyond which nothing is near.
+        close: [m] clearance beyond the margin below which a path is called close.
+    """
+
+    moments: int = 400
+    cut: float = 0.5
+    close: float = 0.002
+
+
+CONSTANTS = ClosestConstants()
+
+
+@dataclass(frozen=True, eq=False)
+class ClosestApproach:
+    """The nearest of the sampled moments of a trajectory.
+
+    Args:
+        time: of the moment [s].
+        link: index of the nearest link.
+        name: name of the joint that moves it.
+        clearance: distance of that link from the map, less the margin [m].
+        gaussian: row of the nearest Gaussian in the model of the field.
+        point: (3,) its nearest point [m, world].
+        at_base: (3,) the same in the frame of the base [m].
+    """
+
+    time: float
+    link: int
+    name: str
+    clearance: float
+    gaussian: int
+    point: Array
+    at_base: Array
+
+    @property
+    def close(self) -> bool:
+        """Whether the clearance is small compared with errors that the margin does not cover."""
+        return self.clearance < CONSTANTS.close
+
+    def describe(self, mapped: int) -> str:
+        """Describe the moment, for a field of which the first ``mapped`` Gaussians are the map."""
+        what = "the map" if self.gaussian < mapped else "unknown space"
+        place = ", ".join(f"{x:.2f}" for x in self.at_base)
+        named = f" (after {self.name})" if self.name else ""
+        away = f"{1e3 * self.clearance:.1f} mm beyond the margin from {what}"
+        return f"link {self.link}{named} at {self.time:.2f} s, {away} at ({place}) m from the base"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the moment as JSON values."""
+        return {
+            "time_s": round(self.time, 3),
+            "link": self.link,
+            "joint": self.name,
+            "clearance_m": self.clearance,
+            "point_world_m": self.point.tolist(),
+            "point_base_m": self.at_base.tolist(),
+        }
+
+
+def closest_approach(
+    arm: RobotSpheres, field: GaussianCollisionField, trajectory: JointTrajectory
+) -> ClosestApproach | None:
+    """Find the sampled moment at which an arm is nearest to a field; None if it is farther than 0.5 m.
+
+    Args:
+        arm: collision spheres of the robot, with the pose of its base and the margin.
+        field: collision field of the map, and of unknown space.
+        trajectory: the trajectory.
+    """
+    times = np.linspace(0.0, trajectory.duration, CONSTANTS.moments)
+    q = trajectory.at(times).position
+    found = arm.clearance(field, q, cut=CONSTANTS.cut)
+    k = int(np.argmin(found.distance))
+    if found.link[k] < 0:
+        return None
+    own = arm.spheres.link == found.link[k]
+    near = field.clearance(arm.centers(q[k : k + 1])[0][own], cut=2 * CONSTANTS.cut)
+    point = near.witness[int(np.argmin(near.distance - arm.spheres.radii[own]))]
+    link = int(found.link[k])
+    return ClosestApproach(
+        time=float(times[k]),
+        link=link,
+        name=trajectory.names[link - 1] if link > 0 else "",
+        clearance=float(found.distance[k]),
+        gaussian=int(found.index[k]),
+        point=point,
+        at_base=transform_points(inverse(arm.T_world_base), point),
+    )
