@@ -237,7 +237,7 @@ def _print_summary(result: RunResult) -> None:
         ("frames tracked", f"{m['tracked']} of {m['frames']}" + (f", {m['skipped']} skipped" if m["skipped"] else "")),
         *_mishaps(m),
         *_pace(m),
-        ("ATE RMSE", metres(m["ate_rmse_m"])),
+        ("ATE RMSE", metres(m["ate_rmse_m"]) + (" from the log's reference poses" if m["ate_frames"] else "")),
         ("PSNR, held-out views", decibels(m["psnr_holdout_db"])),
         ("depth error, median", metres(m["depth_median_m"])),
         ("Gaussians", f"{count(m['gaussians'])}, {megabytes(m['map_bytes'])}"),

@@ -328,5 +328,5 @@ def _margin_text(covers: dict[str, Any]) -> str:
         return {"user": "as given", "none": "0, so that errors of the map are not covered"}[covers["margin_from"]]
     return (
         f"audited: {100 * covers['confidence']:g} % of {covers['region_points']} measured points near the motion are "
-        f"within {1e3 * covers['region_error_m']:.1f} mm of the map; earlier paths may require more"
+        f"within {1e3 * covers['region_error_m']:.1f} mm of the map; the margin is at least that"
     )
