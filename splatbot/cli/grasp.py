@@ -340,5 +340,5 @@ def _print(result: GraspResult, folder: Path, margin: str, *, verbose: bool) -> 
         print_text("a measured contact is within 3 mm of depth that three frames agree on; an implied one is not")
         if any(g.implied and any(g.implied) for g in result.grasps):
             print_text(
-                "WARNING: an implied side may be elsewhere, which conf. does not cover; look at it from there first"
+                "warning: an implied side may be elsewhere, and conf. does not cover that; map it from there first"
             )
