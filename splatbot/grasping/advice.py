@@ -44,7 +44,7 @@ _CHANGES = (
     ),
     (
         "where no plan may end",
-        "its pre-grasps are too near to the map or in unknown space",
+        "its pre-grasps are too near the map or in unknown space",
         "start nearer (a smaller --pregrasp), map the place from more sides, or let unknown space be free",
     ),
     (

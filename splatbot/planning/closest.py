@@ -55,7 +55,7 @@ class ClosestApproach:
 
     @property
     def close(self) -> bool:
-        """Whether the clearance is small compared with errors that the margin does not cover."""
+        """Return whether the clearance is small compared with errors that the margin does not cover."""
         return self.clearance < CONSTANTS.close
 
     def describe(self, mapped: int) -> str:

@@ -75,7 +75,7 @@ def obstacles(
 def field_of(
     space: UnknownSpace, policy: UnknownPolicy, arm: RobotSpheres, start: ArrayLike, *, margin: float = 0.0
 ) -> GaussianCollisionField | None:
-    """Return the field of :func:`obstacles` alone; None if there are none."""
+    """Return the field of :func:`obstacles` alone, or None without obstacles."""
     solids = obstacles(space, policy, arm, start, margin=margin)
     return GaussianCollisionField(solids) if len(solids) else None
 
