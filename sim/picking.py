@@ -6,7 +6,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import mujoco
+import numpy as np
+
 from splatbot.errors import InputError
+from splatbot.geometry import quat_multiply
 from splatbot.grasping.affordance import Affordance, NameHint, Target, find_target
 from splatbot.grasping.pick import Picker
 from splatbot.grasping.pick_types import PickOptions, PickResult, PickStep
@@ -16,6 +20,7 @@ from splatbot.sim.controller import TwinController
 from splatbot.sim.motion import base_of
 from splatbot.sim.scan import scan
 from splatbot.sim.twin import Twin
+from splatbot.sim.wrist_camera import TwinWristCamera
 from splatbot.workspace import NamedPlace
 
 
@@ -51,6 +56,8 @@ class TwinPick:
                 "total": grasp.total,
             },
             "opening_m": result.opening,
+            "attempts": result.attempts,
+            "shift_m": result.shift,
             "rose_m": self.rose,
         }
 
@@ -64,6 +71,8 @@ def pick_in_twin(
     views: int = 8,
     margin: float = 0.0,
     home: bool = False,
+    look: bool = True,
+    moved: float = 0.0,
     seed: int = 0,
     stop: Callable[[], bool] | None = None,
     on_step: Callable[[PickStep], None] | None = None,
@@ -78,6 +87,8 @@ def pick_in_twin(
         views: number of views of the scan.
         margin: clearance [m] that hand and arm keep from the map.
         home: carry the object to the arm's initial configuration.
+        look: look again from the wrist before the fingers close and after the lift.
+        moved: distance [m] by which the target is pushed aside after the scan, as by a person.
         seed: of the scan's noise.
         stop: polled continuously; True ends the pick.
         on_step: called after each stage.
@@ -92,10 +103,13 @@ def pick_in_twin(
     known = scanned(twin, views, seed)
     found = find_target(NameHint(target), known, backends)
     before = _heights(twin)
+    if moved > 0.0:
+        push_aside(twin, _nearest(twin, known, found), moved, seed)
     if home:
         options = replace(options, carry_to=tuple(controller.position.tolist()))
     sampler = GraspSampler(known, robot, margin=margin)
-    picker = Picker(sampler, controller, controller.gripper, options=options, stop=stop, on_step=on_step)
+    camera = TwinWristCamera(twin, seed=seed) if look else None
+    picker = Picker(sampler, controller, controller.gripper, options=options, stop=stop, on_step=on_step, camera=camera)
     result = picker.pick(found)
     return TwinPick(result, found, {name: height - before[name] for name, height in _heights(twin).items()})
 
@@ -105,6 +119,23 @@ def scanned(twin: Twin, views: int, seed: int) -> SegmentedMap:
     movable = [obj.name for obj in twin.scene.objects if obj.movable]
     names = [NamedPlace(name, twin.data.body(f"object/{name}").xipos.copy()) for name in movable]
     return segment(scan(twin, views=views, seed=seed), base_of(twin.scene), names=names)
+
+
+def push_aside(twin: Twin, name: str, distance: float, seed: int) -> None:
+    """Move an object by a distance [m] in a random horizontal direction, and turn it by up to 10 degrees."""
+    rng = np.random.default_rng(seed)
+    angle, turn = rng.uniform(-np.pi, np.pi), rng.uniform(-np.radians(10.0), np.radians(10.0))
+    joint = twin.data.joint(int(twin.world.model.body(f"object/{name}").jntadr[0]))
+    joint.qpos[:2] += distance * np.array([np.cos(angle), np.sin(angle)])
+    joint.qpos[3:] = quat_multiply([np.cos(turn / 2), 0.0, 0.0, np.sin(turn / 2)], joint.qpos[3:])
+    mujoco.mj_forward(twin.world.model, twin.data)
+
+
+def _nearest(twin: Twin, known: SegmentedMap, target: Target) -> str:
+    """Return the movable object that is nearest to a target."""
+    middle = known.model.means.detach().double().numpy()[target.rows].mean(axis=0)
+    movable = [obj.name for obj in twin.scene.objects if obj.movable]
+    return min(movable, key=lambda name: float(np.linalg.norm(twin.data.body(f"object/{name}").xipos - middle)))
 
 
 def _heights(twin: Twin) -> dict[str, float]:

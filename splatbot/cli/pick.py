@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
 from splatbot.cli.paths import check_output
+from splatbot.errors import InputError
 
 if TYPE_CHECKING:
     from splatbot.sim.picking import TwinPick
@@ -26,10 +27,13 @@ def pick(
     tries: int = 5,
     margin: float = 0.0,
     home: bool = False,
+    look: bool = True,
+    attempts: int = 3,
+    moved: float = 0.0,
     seed: int = 0,
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
 ) -> int:
-    """Pick an object in the twin: scan, find grasps, plan, approach, close, lift, check.
+    """Pick an object in the twin: scan, find grasps, plan, look again, approach, close, lift, check.
 
     The scene is scanned by a depth camera through the scene's sensor effects; all later steps use only that map. The
     whole path is certified before the arm moves. Writes pick.json: outcome, stage, times, grasp, and the height
@@ -37,6 +41,8 @@ def pick(
 
     Examples:
         splatbot pick tabletop_clutter --target can
+        splatbot pick tabletop_clutter --target can --moved 0.03
+        splatbot pick tabletop_clutter --target can --moved 0.03 --no-look
         splatbot pick tabletop_clutter --target "largest box" --force 40 --home
         SPLATBOT_VLM_URL=http://127.0.0.1:8000/v1 SPLATBOT_VLM_MODEL=qwen splatbot pick my.yaml --target mug --vlm
 
@@ -51,6 +57,9 @@ def pick(
         tries: largest number of grasps to plan for.
         margin: clearance [m] of hand and arm to the map.
         home: carry the object to the home configuration.
+        look: look again from the wrist: correct the grasp before the fingers close, and check that the place is empty.
+        attempts: largest number of grasps that are executed; more than one needs --look.
+        moved: distance [m] by which the target is pushed aside after the scan, to see how the pick copes.
         seed: seed of sensor noise and search.
         out: folder to write to; by default runs/pick.
     """
@@ -65,9 +74,14 @@ def pick(
     from splatbot.sim.twin import Twin
 
     backends = name_backends(vlm=vlm)
-    options = PickOptions(lift=lift, force=force, tries=tries, grasp=GraspOptions(seed=seed), seed=seed)
+    if not 0.0 <= moved <= 0.2:
+        raise InputError(f"is {moved:g}.", field="--moved", hint="give metres, 0 to 0.2")
+    options = PickOptions(
+        lift=lift, force=force, tries=tries, grasp=GraspOptions(seed=seed), attempts=attempts, seed=seed
+    )
     twin = Twin(load_scene(scene))
-    picked = pick_in_twin(twin, target, backends, options, views=views, margin=margin, home=home, seed=seed)
+    settings: dict[str, Any] = {"views": views, "margin": margin, "home": home, "look": look, "moved": moved}
+    picked = pick_in_twin(twin, target, backends, options, seed=seed, **settings)
     folder = out if out is not None else Path("runs") / "pick"
     folder.mkdir(parents=True, exist_ok=True)
     with atomic_write(folder / "pick.json") as handle:

@@ -4,9 +4,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
 
 from splatbot.errors import GripperError, InputError, SplatbotError
 from splatbot.grasping.affordance import Target
+from splatbot.grasping.hands import Hands
+from splatbot.grasping.look import CONSTANTS as LOOK
+from splatbot.grasping.look import WristCamera, in_the_way, relocate, share_gone
 from splatbot.grasping.pick_planner import MapPickPlanner, PickPlan, PickPlanner, Segment
 from splatbot.grasping.pick_types import PickOptions, PickOutcome, PickResult, PickStage, PickStep
 from splatbot.grasping.sampler import GraspSampler
@@ -27,12 +33,24 @@ class _EndedError(Exception):
         super().__init__(reason)
 
 
+class _MissedError(_EndedError):
+    """Ends an attempt after which the next grasp may be tried; ``back`` leads to the pre-grasp, if it is not there."""
+
+    def __init__(self, outcome: PickOutcome, reason: str, back: Segment | None = None) -> None:
+        super().__init__(outcome, reason)
+        self.back = back
+
+
 class Picker:
     """Picks objects of one state of the map.
 
     All segments are certified before the arm moves: the path to the pre-grasp, the straight approach and the straight
     lift. On the lift the object is part of the arm as attached spheres. Any failure ends the pick and stops the arm.
     Fingers that hold an object keep it; fingers that closed without an object open again.
+
+    With a wrist camera the loop is closed. At the pre-grasp the arm looks again. If the target moved by up to 5 cm, it
+    plans to the new place; if something is in the way, it tries the next grasp. After the lift it looks whether the
+    place is empty. If the fingers hold nothing, or something of another width, it goes back and tries the next grasp.
 
     Args:
         sampler: grasp sampler with the map, the robot and its base pose.
@@ -43,8 +61,10 @@ class Picker:
         on_step: called after each completed stage.
         make_planner: returns the planner of a target. If None, a
             :class:`splatbot.grasping.pick_planner.MapPickPlanner` is used.
+        camera: the arm's wrist camera. If None, the arm does not observe the scene, and one grasp is executed.
 
     Raises:
+        InputError: a wrist camera and another planner are given, because only that of the map follows a moved target.
         InputError: the stroke of the gripper is smaller than that of the robot's hand model.
     """
 
@@ -58,13 +78,17 @@ class Picker:
         stop: Callable[[], bool] | None = None,
         on_step: Callable[[PickStep], None] | None = None,
         make_planner: Callable[[Target], PickPlanner] | None = None,
+        camera: WristCamera | None = None,
     ) -> None:
+        if camera is not None and make_planner is not None:
+            hint = "leave make_planner out"
+            raise InputError("needs the planner of the map.", field="camera", hint=hint)
         if gripper.stroke < sampler.hand.stroke - 1e-6:
             text = f"opens {gripper.stroke:g} m, the hand of the robot {sampler.hand.stroke:g} m."
             raise InputError(text, field="gripper", hint="give the robot that has this gripper")
         self.sampler, self.controller, self.gripper = sampler, controller, gripper
         self.options = options or PickOptions()
-        self._stop, self._on_step = stop, on_step
+        self._stop, self._on_step, self.camera = stop, on_step, camera
         self.make_planner = make_planner or (lambda target: MapPickPlanner(sampler, target, self.options))
 
     def pick(self, target: Target, *, grasps: GraspResult | None = None) -> PickResult:
@@ -94,6 +118,8 @@ class _Pick:
         self.q: Array | None = None
         self.planning_seconds: float | None = None
         self.notes: list[str] = []
+        self.left: list[tuple[int, Grasp]] = []
+        self.attempts, self.shift = 0, None if picker.camera is None else 0.0
         self._began = time.perf_counter()
 
     def run(self, grasps: GraspResult | None) -> PickResult:
@@ -102,9 +128,8 @@ class _Pick:
             if not found.grasps:
                 raise _EndedError(PickOutcome.NO_GRASP, NoGraspError(found).message)
             self._done(f"{len(found.grasps)} grasps of {found.candidates} hands")
-            plan = self._plan(found)
-            self.grasp, self.planning_seconds = plan.grasp, plan.planning_seconds
-            self._execute(plan)
+            self.left = list(enumerate(found.grasps, start=1))
+            self._try_in_turn()
         except _EndedError as end:
             return self._ended(end)
         except GripperError as error:
@@ -115,18 +140,34 @@ class _Pick:
             return self._ended(_EndedError(PickOutcome.NOT_FOLLOWED, error.message, error))
         return self._result(PickOutcome.PICKED, "")
 
-    def _plan(self, found: GraspResult) -> PickPlan:
-        """Plan to the grasps in order of their score, and return the first plan that is found."""
-        self.stage = PickStage.PLAN
+    def _try_in_turn(self) -> None:
+        """Execute grasps until one holds the object, each after the failure of the one before."""
         self.planner = self.p.make_planner(self.target)
+        while True:
+            plan = self._plan()
+            self.attempts += 1
+            try:
+                return self._execute(plan)
+            except _MissedError as miss:
+                if self.p.camera is None or self.attempts >= self.o.attempts or not self.left:
+                    raise
+                self._done(f"{miss.outcome}: {miss.reason}; the next grasp is tried")
+                if miss.back is not None:
+                    self._follow(PickStage.APPROACH, miss.back, self.o.slow)
+
+    def _plan(self) -> PickPlan:
+        """Plan to the grasps in order of their score, and return the first plan that is found; the rest is left."""
+        self.stage = PickStage.PLAN
         start = self.controller.step().position
-        candidates = list(enumerate(found.grasps[: self.o.tries], start=1))
+        candidates = self.left[: self.o.tries]
         attempts = [(k, grasp, grasp.avoids_moving and self.s.moving is not None) for k, grasp in candidates]
         attempts += [(k, grasp, False) for k, grasp, avoid_moving in attempts if avoid_moving]
         reasons: list[str] = []
         for k, grasp, avoid_moving in attempts:
             plan = self.planner.plan_to(grasp, start, avoid_moving=avoid_moving)
             if isinstance(plan, PickPlan):
+                self.left = [(number, each) for number, each in self.left if number > k]
+                self.grasp, self.planning_seconds = plan.grasp, plan.planning_seconds
                 self._note_moving(plan)
                 self._done(f"grasp {k}, {grasp.approach}; {1e3 * plan.clearance:.1f} mm minimum clearance")
                 return plan
@@ -144,13 +185,50 @@ class _Pick:
         self._settle()
         self._done(f"{1e3 * self.gripper.opening():.0f} mm")
         self._follow(PickStage.MOVE, plan.to_pregrasp, 1.0)
+        if self.p.camera is not None:
+            plan = self._look(self.p.camera, plan)
         self._follow(PickStage.APPROACH, plan.approach, self.o.slow)
         self._close(plan)
         self._follow(PickStage.LIFT, plan.lift_off, self.o.slow)
         self._follow(PickStage.LIFT, plan.lift, self.o.slow)
-        self._check()
+        self._check(plan)
         if self.o.carry_to is not None:
             self._carry(plan)
+
+    def _look(self, camera: WristCamera, plan: PickPlan) -> PickPlan:
+        """Look at the target from the pre-grasp; return the plan to where it is now."""
+        self.stage = PickStage.LOOK
+        view = camera.look()
+        found = relocate(self.s.scene, self.s.surface(self.target), view)
+        if found.reason:
+            raise _EndedError(PickOutcome.TARGET_MOVED, found.reason)
+        self.shift = found.shift
+        agrees = f"{100 * found.share:.0f} % of {found.points} points agree"
+        if not found.still:
+            self._done(f"moved by {1e3 * found.shift:.1f} mm, {np.degrees(found.turn):.1f} degrees; {agrees}")
+            plan = self._adjusted(plan, found.T_now_before)
+        retreat = float(np.linalg.norm(plan.grasp.T_world_tcp[:3, 3] - plan.grasp.T_world_pregrasp[:3, 3]))
+        hand = Hands.one(plan.grasp.T_world_tcp, plan.opening)
+        deep = in_the_way(hand, self.s.hand, view, retreat)
+        if deep > LOOK.max_penetration:
+            raise _MissedError(PickOutcome.OBSTRUCTED, f"depth is {1e3 * deep:.1f} mm deep in the hand on its way")
+        if found.still:
+            self._done(f"in its place; {agrees}")
+        return plan
+
+    def _adjusted(self, plan: PickPlan, T_now_before: Array) -> PickPlan:
+        """Move to the pre-grasp at the target's new place; grasps that are left move along."""
+        self.stage = PickStage.ADJUST
+        here = self.controller.step().position
+        assert isinstance(self.planner, MapPickPlanner)
+        adjusted = self.planner.adjusted(plan, T_now_before, self.target, here)
+        if isinstance(adjusted, str):
+            raise _MissedError(PickOutcome.NO_PLAN, adjusted)
+        self.s, self.planner, self.grasp = adjusted.sampler, adjusted.planner, adjusted.plan.grasp
+        moved = [(k, adjusted.planner.moved(grasp, T_now_before)) for k, grasp in self.left]
+        self.left = [(k, grasp) for k, grasp in moved if grasp is not None]
+        self._follow(PickStage.ADJUST, adjusted.plan.to_pregrasp, self.o.slow)
+        return adjusted.plan
 
     def _close(self, plan: PickPlan) -> None:
         self.stage = PickStage.CLOSE
@@ -158,17 +236,38 @@ class _Pick:
         self._settle()
         self.opening = self.gripper.opening()
         if not self.gripper.holds():
-            self.gripper.move(plan.opening)
-            raise _EndedError(PickOutcome.NOTHING_HELD, "the fingers closed without an object and opened again")
+            self._open_again(plan)
+            reason = "the fingers closed without an object and opened again"
+            raise _MissedError(PickOutcome.NOTHING_HELD, reason, _reversed(plan.approach))
+        wide, expected = f"{1e3 * self.opening:.1f} mm", f"{1e3 * plan.grasp.width:.1f} mm expected"
+        if self.p.camera is not None and abs(self.opening - plan.grasp.width) > self.o.width_tolerance:
+            self._open_again(plan)
+            reason = f"the fingers stopped at {wide}, {expected}, and opened again"
+            raise _MissedError(PickOutcome.UNEXPECTED_WIDTH, reason, _reversed(plan.approach))
         self.attached = plan.attached
-        self._done(f"{1e3 * self.opening:.1f} mm between the fingers, {1e3 * plan.grasp.width:.1f} mm expected")
+        self._done(f"{wide} between the fingers, {expected}")
 
-    def _check(self) -> None:
+    def _open_again(self, plan: PickPlan) -> None:
+        self.gripper.move(plan.opening)
+        if self.p.camera is not None:  # another attempt follows
+            self._settle()
+
+    def _check(self, plan: PickPlan) -> None:
+        """Check by the fingers, and by the camera, that the object left its place."""
         self.stage = PickStage.CHECK
         if not self.gripper.holds():
             self.attached = None
-            raise _EndedError(PickOutcome.LOST, "the object is no longer between the fingers")
-        self._done(f"{1e3 * self.gripper.opening():.1f} mm between the fingers")
+            if self.p.camera is not None:
+                self._open_again(plan)
+            raise _MissedError(PickOutcome.LOST, "the object is no longer between the fingers")
+        note = f"{1e3 * self.gripper.opening():.1f} mm between the fingers"
+        if self.p.camera is not None:
+            gone = share_gone(self.s.surface(self.target).points, self.p.camera.look())
+            if gone is not None and gone < LOOK.min_gone:
+                reason = f"only {100 * gone:.0f} % of its place is empty, so the fingers hold something else"
+                raise _EndedError(PickOutcome.LOST, reason)
+            note += "; its place is hidden" if gone is None else f"; {100 * gone:.0f} % of its place is empty"
+        self._done(note)
 
     def _carry(self, plan: PickPlan) -> None:
         """Carry the object to ``PickOptions.carry_to`` on a path that is planned with the attached object."""
@@ -235,5 +334,10 @@ class _Pick:
     def _result(self, outcome: PickOutcome, reason: str, error: SplatbotError | None = None) -> PickResult:
         return PickResult(
             outcome, self.stage, reason, self.grasp, tuple(self.steps), self.opening, self.attached, self.q, error,
-            self.planning_seconds, tuple(self.notes),
+            self.planning_seconds, tuple(self.notes), self.attempts, self.shift,
         )  # fmt: skip
+
+
+def _reversed(segment: Segment) -> Segment:
+    """Return the way back, which has the same certificate."""
+    return replace(segment, path=replace(segment.path, waypoints=segment.path.waypoints[::-1].copy()))

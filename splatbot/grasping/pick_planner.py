@@ -15,12 +15,14 @@ from splatbot.geometry import inverse, transform_points
 from splatbot.grasping.affordance import Target
 from splatbot.grasping.attached import covering_spheres
 from splatbot.grasping.hands import CONSTANTS as HANDS
+from splatbot.grasping.moved_target import moved_grasp, moved_sampler
 from splatbot.grasping.obstacles import around_target
 from splatbot.grasping.pick_types import PickOptions
 from splatbot.grasping.sampler import GraspSampler
 from splatbot.grasping.types import Grasp
-from splatbot.planning import GaussianRRTStar, JointGoal, Path
+from splatbot.planning import GaussianRRTStar, JointGoal, Path, PoseGoal
 from splatbot.planning.cartesian import StraightResult, straight_line
+from splatbot.planning.goals import goal_configurations
 from splatbot.protocols import Array
 
 
@@ -198,6 +200,38 @@ class MapPickPlanner:
                 return Segment(result.path, planner.arm, obstacles.around_held, avoids_moving)
         return result.reason
 
+    def adjusted(self, plan: PickPlan, T_now_before: Array, target: Target, here: Array) -> Adjusted | str:
+        """Plan a pick of the target at its new place, from the arm's position near the old pre-grasp.
+
+        The planner of the new place, its plan, and the sampler of the moved map belong together.
+
+        Args:
+            plan: the plan to the old place.
+            T_now_before: (4, 4) motion of the target in the world [m].
+            target: the target.
+            here: (J,) joint positions [rad or m].
+        """
+        sampler = moved_sampler(self.s, target.rows, T_now_before)
+        planner = MapPickPlanner(sampler, target, self.o)
+        arm = self._arm(plan.opening)
+        goal = T_now_before @ plan.grasp.T_world_pregrasp
+        way = straight_line(arm, planner._static.whole, here, goal)
+        if not way or way.path is None:
+            return f"its new pre-grasp is not reached: {way.reason.rstrip('.')}"
+        grasp = moved_grasp(plan.grasp, T_now_before, way.path.waypoints[-1])
+        found = planner.plan_to(grasp, here)
+        return found if isinstance(found, str) else Adjusted(sampler, planner, found)
+
+    def moved(self, grasp: Grasp, T_now_before: Array) -> Grasp | None:
+        """Return a grasp of the target after its motion (4, 4) in the world, or None if the arm does not reach it."""
+        opening = min(grasp.opening + HANDS.opening_step, self.s.hand.stroke)
+        goal = PoseGoal(T_now_before @ grasp.T_world_pregrasp, postures=1)
+        near = self.s.robot.home if grasp.q_pregrasp is None else grasp.q_pregrasp
+        found = goal_configurations(
+            self._arm(opening), self._static.whole, goal, near=near, seed=self.o.seed, until=time.perf_counter()
+        )
+        return moved_grasp(grasp, T_now_before, found.q[0]) if len(found.q) else None
+
     def _obstacles(self, avoid_moving: bool) -> tuple[_Obstacles, bool]:
         """Return the obstacles of a plan, and whether they include all regions where motion was observed."""
         if avoid_moving and self._avoiding_moving is not None:
@@ -218,6 +252,21 @@ class MapPickPlanner:
 
     def _up(self, arm: RobotSpheres, field: GaussianCollisionField, q: Array, height: float) -> StraightResult:
         return straight_line(arm, field, q, raised(self.s, arm, q, height))
+
+
+@dataclass(frozen=True, eq=False)
+class Adjusted:
+    """A plan after the target moved.
+
+    Args:
+        sampler: of the map in which it moved.
+        planner: of that map.
+        plan: to its new place.
+    """
+
+    sampler: GraspSampler
+    planner: MapPickPlanner
+    plan: PickPlan
 
 
 def target_spheres(sampler: GraspSampler, target: Target) -> Array:

@@ -18,6 +18,8 @@ class PickStage(StrEnum):
     PLAN = "plan"
     OPEN = "open"
     MOVE = "move"
+    LOOK = "look"
+    ADJUST = "adjust"
     APPROACH = "approach"
     CLOSE = "close"
     LIFT = "lift"
@@ -33,7 +35,10 @@ class PickOutcome(StrEnum):
     NO_PLAN = "no plan"  # no grasp has a certified plan
     NOT_FOLLOWED = "not followed"  # the controller faulted or did not reach the end of the trajectory
     GRIPPER_FAILED = "gripper failed"
+    TARGET_MOVED = "target moved"  # the look before the grasp does not find it near its place in the map
+    OBSTRUCTED = "obstructed"  # the look before the grasp shows something in the hand's way
     NOTHING_HELD = "nothing held"
+    UNEXPECTED_WIDTH = "unexpected width"  # the fingers hold something of another width
     LOST = "lost"  # the fingers held the object and lost it
     STOPPED = "stopped"
 
@@ -59,6 +64,9 @@ class PickOptions:
         tries: maximum number of grasps for which a plan is searched.
         budget_ms: planning budget for the path to each pre-grasp [ms].
         grasp: options of grasp sampling.
+        attempts: largest number of grasps that are executed. A second one needs a wrist camera, because a failed grasp
+            may move the object.
+        width_tolerance: largest difference between the expected width and that at which the fingers rest [m].
         carry_to: (J,) joint positions to which the object is carried. If None, the object stays lifted.
         seed: seed of the motion planner.
 
@@ -74,12 +82,15 @@ class PickOptions:
     tries: int = 5
     budget_ms: float = 200.0
     grasp: GraspOptions = field(default_factory=GraspOptions)
+    attempts: int = 3
+    width_tolerance: float = 0.015
     carry_to: tuple[float, ...] | None = None
     seed: int = 0
 
     def __post_init__(self) -> None:
         good = 0.0 < self.lift_off < self.lift <= 1.0 and 0.0 < self.speed <= 1.0 and 0.0 < self.slow <= 1.0
-        if not good or self.tries < 1 or not self.budget_ms > 0.0 or (self.force is not None and not self.force > 0.0):
+        counts = min(self.tries, self.attempts) >= 1 and self.budget_ms > 0.0 and self.width_tolerance > 0.0
+        if not good or not counts or (self.force is not None and not self.force > 0.0):
             hint = "give metres with 0 < lift_off < lift <= 1, fractions in 0..1, tries >= 1, and newtons above 0"
             raise InputError("is out of range.", field="options", hint=hint)
 
@@ -115,6 +126,8 @@ class PickResult:
         q: (J,) last commanded joint positions. If None, the arm did not move.
         error: error of the component that failed.
         planning_seconds: duration of planning the path to the pre-grasp [s]. If None, no plan was found.
+        attempts: number of grasps that were executed.
+        shift: distance by which the last look found the target moved [m]. If None, there was no look.
         notes: remarks on the executed plan, each a sentence.
     """
 
@@ -129,6 +142,8 @@ class PickResult:
     error: SplatbotError | None = None
     planning_seconds: float | None = None
     notes: tuple[str, ...] = ()
+    attempts: int = 0
+    shift: float | None = None
 
     def __bool__(self) -> bool:
         return self.outcome is PickOutcome.PICKED
@@ -161,6 +176,9 @@ _HINTS = {
     PickOutcome.NO_PLAN: "clear the surroundings, give more tries or a larger budget_ms",
     PickOutcome.NOT_FOLLOWED: "reset the controller and remove the obstacle",
     PickOutcome.GRIPPER_FAILED: "check the gripper and activate it",
+    PickOutcome.TARGET_MOVED: "map the scene again",
+    PickOutcome.OBSTRUCTED: "map the scene again: something is where the hand has to be",
+    PickOutcome.UNEXPECTED_WIDTH: "map the target from more sides, or allow more (width_tolerance)",
     PickOutcome.NOTHING_HELD: "map the target again: it may have moved",
     PickOutcome.LOST: "press harder, lift slower, or grasp nearer to its middle",
     PickOutcome.STOPPED: None,

@@ -1,0 +1,240 @@
+"""A look from the wrist before the fingers close: where the target is now, what is in the way, and whether it is gone.
+
+The map is some seconds old when the hand arrives. One depth image at the pre-grasp shows whether the target moved, and
+one after the lift whether its place is empty.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import open3d as o3d
+from scipy.spatial import cKDTree
+
+from splatbot.collision.visibility import DepthView, measured_depths
+from splatbot.geometry import inverse, transform_points
+from splatbot.grasping.hands import Hands
+from splatbot.grasping.measured import hand_penetration
+from splatbot.grasping.surface import GraspSurface
+from splatbot.protocols import Array, HandShape
+from splatbot.segmentation import SegmentedMap
+
+
+@dataclass(frozen=True)
+class LookConstants:
+    """Constants of a look from the wrist.
+
+    Args:
+        max_shift: [m] largest motion of the target that is corrected.
+        max_turn: [rad] largest rotation of the target that is corrected.
+        starts: [m] offsets along both axes of the support from which the registration starts.
+        reaches: [m] largest distance of a pair in each iteration of ICP.
+        voxel: [m] spacing of the depth that ICP uses.
+        close: [m] distance at which a surface point agrees with depth.
+        min_points: least number of surface points that the image shows.
+        min_share: least share of them that agree with depth.
+        tie: share by which a rotated pose must fit better than a shifted one, because round objects have no angle.
+        noise: [m], [rad] smaller changes are noise, and nothing is corrected.
+        support: [m] depth so close to a support is of the support.
+        facing: least cosine between the normal of a surface point and the direction to the camera.
+        around: [m] radius around the tool in which depth may be in the hand.
+        neighbours: least number of other points within ``close`` of a point in the hand.
+        gone: [m] depth so far behind a surface point shows that it is gone.
+        min_gone: least share of the surface points that must be gone after a lift.
+        max_penetration: [m] accepted depth of a point in the hand, with the noise of one image.
+    """
+
+    max_shift: float = 0.05
+    max_turn: float = float(np.radians(25.0))
+    starts: tuple[float, ...] = (0.0, -0.025, 0.025)
+    reaches: tuple[float, ...] = (0.03, 0.03, 0.02, 0.02, 0.015, 0.015, 0.01, 0.01, 0.01, 0.01)
+    voxel: float = 0.003
+    close: float = 0.005
+    min_points: int = 30
+    min_share: float = 0.6
+    tie: float = 0.05
+    noise: tuple[float, float] = (0.002, float(np.radians(2.0)))
+    support: float = 0.005
+    facing: float = 0.2
+    around: float = 0.3
+    neighbours: int = 4
+    gone: float = 0.015
+    min_gone: float = 0.5
+    max_penetration: float = 0.005
+
+
+CONSTANTS = LookConstants()
+
+
+class WristCamera(Protocol):
+    """A depth camera that the arm carries."""
+
+    def look(self) -> DepthView:
+        """Return the depth (H, W) [m] that the camera sees now, the camera, and T_world_camera (4, 4).
+
+        Pixels of the arm itself are 0. The world is the frame of the map.
+        """
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Relocation:
+    """Where a look found the target.
+
+    Args:
+        T_now_before: (4, 4) motion of the target since it was mapped, in the world [m]; the identity within noise.
+        shift: distance by which its middle moved [m].
+        turn: angle by which it turned [rad].
+        share: share of the shown surface points that agree with depth.
+        points: number of surface points that the image shows.
+        reason: why the target was not found; empty if it was.
+    """
+
+    T_now_before: Array
+    shift: float
+    turn: float
+    share: float
+    points: int
+    reason: str = ""
+
+    @property
+    def still(self) -> bool:
+        """Return whether the target did not move beyond noise."""
+        return bool(np.array_equal(self.T_now_before, np.eye(4)))
+
+
+def relocate(scene: SegmentedMap, surface: GraspSurface, view: DepthView) -> Relocation:
+    """Find a target in one depth image, near the place where it was mapped.
+
+    1. The surface points that face the camera are registered to the depth by point-to-plane ICP (Chen and Medioni
+       1992), first by shifts alone, from nine offsets in the plane of the support.
+    2. From the best shift, ICP with Tukey weights estimates a turn too. It counts only if it improves the fit, because
+       round objects have no angle.
+    3. Changes within noise count as none, and large ones as another object.
+
+    Args:
+        scene: the segmented map.
+        surface: surface of the target, from that map.
+        view: the depth image, without the arm.
+    """
+    seen = _points(view)
+    middle, radius = surface.points.mean(axis=0), np.ptp(surface.points, axis=0).max() / 2
+    seen = seen[np.linalg.norm(seen - middle, axis=1) < radius + 1.5 * CONSTANTS.max_shift]
+    own = transform_points(inverse(scene.T_world_base), seen)
+    for support in scene.supports:
+        above = np.abs(support.height(own)) > CONSTANTS.support
+        seen, own = seen[above], own[above]
+    to_camera = view[2][:3, 3] - surface.points
+    cosine = (surface.normals * to_camera).sum(axis=1) / np.linalg.norm(to_camera, axis=1)
+    source = surface.points[surface.observed & (cosine > CONSTANTS.facing)]
+    if len(source) < CONSTANTS.min_points or len(seen) < CONSTANTS.min_points:
+        return Relocation(np.eye(4), 0.0, 0.0, 0.0, min(len(source), len(seen)), "the image does not show it")
+    target = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(seen)).voxel_down_sample(CONSTANTS.voxel)
+    target.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(radius=4 * CONSTANTS.voxel, max_nn=20))
+    tree = cKDTree(np.asarray(target.points))
+    shifts = [np.eye(4), *_shifted(source, tree, np.asarray(target.normals), scene.up)]
+    best, share, points = max(((T, *_fit(T, source, tree, view)) for T in shifts), key=lambda each: each[1])
+    turned = _turned(source, target, best)
+    fit, count = _fit(turned, source, tree, view)
+    if fit > share + CONSTANTS.tie:
+        best, share, points = turned, fit, count
+    return _judged(best, share, points, middle)
+
+
+def in_the_way(hands: Hands, hand: HandShape, view: DepthView, retreat: float) -> float:
+    """Return how deep [m] depth lies in a hand on its straight approach. Pixels without neighbours fly at edges.
+
+    Args:
+        hands: one hand at the grasp.
+        hand: its shape.
+        view: the depth image, without the arm.
+        retreat: length of the approach [m].
+    """
+    points = _points(view)
+    near = points[np.linalg.norm(points - hands.T[0, :3, 3], axis=1) < CONSTANTS.around + retreat]
+    if not len(near):
+        return 0.0
+    tree = cKDTree(near)
+    several = tree.query_ball_point(near, CONSTANTS.close, return_length=True) > CONSTANTS.neighbours
+    return float(hand_penetration(hands, near[several], hand, retreat=retreat)[0])
+
+
+def share_gone(points: Array, view: DepthView) -> float | None:
+    """Return the share of surface points (P, 3) [m, world] behind which the image sees; None if it shows too few.
+
+    Points that something nearer hides do not count.
+    """
+    _, measured, own = measured_depths(points, *view)
+    shown = measured > own - CONSTANTS.gone
+    if shown.sum() < CONSTANTS.min_points:
+        return None
+    return float((measured[shown] > own[shown] + CONSTANTS.gone).mean())
+
+
+def _points(view: DepthView) -> Array:
+    """Return the measured points (P, 3) of a depth image [m, world]."""
+    depth, camera, T_world_camera = view
+    known = np.isfinite(depth) & (depth > 0)
+    return transform_points(T_world_camera, camera.backproject(depth)[known].astype(np.float64))
+
+
+def _shifted(source: Array, tree: cKDTree, normals: Array, up: Array) -> list[Array]:
+    """Register points (P, 3) to depth with normals (S, 3) by shifts alone; return a pose (4, 4) for each start."""
+    x = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
+    x /= np.linalg.norm(x)
+    y = np.cross(up, x)
+    poses = []
+    for a, b in itertools.product(CONSTANTS.starts, CONSTANTS.starts):
+        T = np.eye(4)
+        T[:3, 3] = a * x + b * y
+        for reach in CONSTANTS.reaches:
+            away, nearest = tree.query(source + T[:3, 3], distance_upper_bound=reach)
+            pairs = np.isfinite(away)
+            n, q = normals[nearest[pairs]], tree.data[nearest[pairs]]
+            residual = (n * (q - source[pairs] - T[:3, 3])).sum(axis=1)
+            # The damping leaves a direction that no normal constrains as it is.
+            T[:3, 3] += np.linalg.solve(n.T @ n + np.eye(3), n.T @ residual)
+        poses.append(T)
+    return poses
+
+
+def _turned(source: Array, target: o3d.geometry.PointCloud, start: Array) -> Array:
+    """Register points (P, 3) to depth by a rigid motion (4, 4), from a start."""
+    registration = o3d.pipelines.registration
+    tukey = registration.TukeyLoss(k=2 * CONSTANTS.close)
+    moving = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(source))
+    estimation = registration.TransformationEstimationPointToPlane(tukey)
+    return np.asarray(
+        registration.registration_icp(moving, target, CONSTANTS.reaches[-1], start, estimation).transformation
+    )
+
+
+def _fit(T: Array, source: Array, tree: cKDTree, view: DepthView) -> tuple[float, int]:
+    """Return the share of the shown points that agree with depth at a pose, and their number."""
+    now = transform_points(T, source)
+    rows, measured, own = measured_depths(now, *view)
+    shown = rows[measured > own - CONSTANTS.gone]  # others are hidden by something nearer
+    if not len(shown):
+        return 0.0, 0
+    return float((tree.query(now[shown])[0] < CONSTANTS.close).mean()), len(shown)
+
+
+def _judged(T: Array, share: float, points: int, middle: Array) -> Relocation:
+    shift, turn = float(np.linalg.norm(transform_points(T, middle) - middle)), _angle(T)
+    reason = ""
+    if points < CONSTANTS.min_points:
+        reason = "the image does not show it"
+    elif share < CONSTANTS.min_share:
+        reason = f"only {100 * share:.0f} % of its surface agrees with depth"
+    elif shift > CONSTANTS.max_shift or turn > CONSTANTS.max_turn:
+        reason = f"it moved by {1e3 * shift:.0f} mm and {np.degrees(turn):.0f} degrees"
+    if reason or (shift <= CONSTANTS.noise[0] and turn <= CONSTANTS.noise[1]):
+        return Relocation(np.eye(4), shift if reason else 0.0, turn if reason else 0.0, share, points, reason)
+    return Relocation(T, shift, turn, share, points)
+
+
+def _angle(T: Array) -> float:
+    return float(np.arccos(np.clip((np.trace(T[:3, :3]) - 1.0) / 2.0, -1.0, 1.0)))
