@@ -36,7 +36,7 @@ class LookConstants:
         close: [m] distance at which a surface point agrees with depth.
         min_points: least number of surface points that the image shows.
         min_share: least share of them that agree with depth.
-        tie: share by which a rotated pose must fit better than a shifted one, because round objects have no angle.
+        tie: ratio of RMS below which a shift counts more than none, and a turn more than a shift.
         noise: [m], [rad] smaller changes are noise, and nothing is corrected.
         support: [m] depth so close to a support is of the support.
         facing: least cosine between the normal of a surface point and the direction to the camera.
@@ -55,7 +55,7 @@ class LookConstants:
     close: float = 0.005
     min_points: int = 30
     min_share: float = 0.6
-    tie: float = 0.05
+    tie: float = 0.93
     noise: tuple[float, float] = (0.002, float(np.radians(2.0)))
     support: float = 0.005
     facing: float = 0.2
@@ -135,13 +135,12 @@ def relocate(scene: SegmentedMap, surface: GraspSurface, view: DepthView) -> Rel
     target = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(seen)).voxel_down_sample(CONSTANTS.voxel)
     target.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(radius=4 * CONSTANTS.voxel, max_nn=20))
     tree = cKDTree(np.asarray(target.points))
-    shifts = [np.eye(4), *_shifted(source, tree, np.asarray(target.normals), scene.up)]
-    best, share, points = max(((T, *_fit(T, source, tree, view)) for T in shifts), key=lambda each: each[1])
-    turned = _turned(source, target, best)
-    fit, count = _fit(turned, source, tree, view)
-    if fit > share + CONSTANTS.tie:
-        best, share, points = turned, fit, count
-    return _judged(best, share, points, middle)
+    shifts = _shifted(source, tree, np.asarray(target.normals), scene.up)
+    shifted = min((_fit(T, source, tree, view) for T in shifts), key=lambda fit: fit.rms)
+    best = _fit(np.eye(4), source, tree, view)
+    for fit in (shifted, _fit(_turned(source, target, shifted.T), source, tree, view)):
+        best = fit if fit.rms < CONSTANTS.tie * best.rms else best
+    return _judged(best, middle)
 
 
 def in_the_way(hands: Hands, hand: HandShape, view: DepthView, retreat: float) -> float:
@@ -212,17 +211,33 @@ def _turned(source: Array, target: o3d.geometry.PointCloud, start: Array) -> Arr
     )
 
 
-def _fit(T: Array, source: Array, tree: cKDTree, view: DepthView) -> tuple[float, int]:
-    """Return the share of the shown points that agree with depth at a pose, and their number."""
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """Agreement with depth at a pose T (4, 4).
+
+    ``rms`` is that of the distances [m], which count at most ``close``; ``share`` of the ``points`` are nearer.
+    """
+
+    T: Array
+    rms: float
+    share: float
+    points: int
+
+
+def _fit(T: Array, source: Array, tree: cKDTree, view: DepthView) -> _Fit:
+    """Compare points (P, 3) at a pose with the depth of a view; points that something nearer hides do not count."""
     now = transform_points(T, source)
     rows, measured, own = measured_depths(now, *view)
-    shown = rows[measured > own - CONSTANTS.gone]  # others are hidden by something nearer
-    if not len(shown):
-        return 0.0, 0
-    return float((tree.query(now[shown])[0] < CONSTANTS.close).mean()), len(shown)
+    shown = rows[measured > own - CONSTANTS.gone]
+    if len(shown) < CONSTANTS.min_points:
+        return _Fit(T, CONSTANTS.close, 0.0, len(shown))
+    away = tree.query(now[shown])[0]
+    rms = float(np.sqrt(np.mean(np.minimum(away, CONSTANTS.close) ** 2)))
+    return _Fit(T, rms, float((away < CONSTANTS.close).mean()), len(shown))
 
 
-def _judged(T: Array, share: float, points: int, middle: Array) -> Relocation:
+def _judged(fit: _Fit, middle: Array) -> Relocation:
+    T, share, points = fit.T, fit.share, fit.points
     shift, turn = float(np.linalg.norm(transform_points(T, middle) - middle)), _angle(T)
     reason = ""
     if points < CONSTANTS.min_points:
