@@ -274,6 +274,12 @@ class PicksRequest(Request):
     budget_ms: Annotated[float, Field(gt=0)] = Field(200.0, description="for the way to each: the knob of time [ms]")
     margin: Annotated[float, Field(ge=0, le=1)] = Field(0.0, description="room to keep from the rest [m]")
     home: bool = Field(False, description="carry it to where the arm began")
+    look: bool = Field(
+        True, description="look again from the wrist before the fingers close, and whether the place is empty after"
+    )
+    attempts: Annotated[int, Field(ge=1, le=10)] = Field(
+        3, description="grasps that are executed; more than 1 needs look"
+    )
     seed: Annotated[int, Field(ge=0, lt=2**31)] = Field(0, description="of sensor noise and search")
 
 

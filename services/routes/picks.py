@@ -40,8 +40,8 @@ def pick(
     """Pick an object in the physics of a scene: scan it, find grasps, plan, approach, close, lift, check.
 
     The whole way is certified before the arm moves. A pick that ends otherwise than "picked" is a result, not a failure
-    of the job; cancelling stops the arm. `progress` grows by the stages: grasp, plan, open, move, approach, close,
-    lift, check and, with `home`, carry.
+    of the job; cancelling stops the arm. `progress` grows by the stages: grasp, plan, open, move, look, adjust,
+    approach, close, lift, check and, with `home`, carry. A further attempt begins again at plan.
     """
     if query.scene not in scene_names():
         raise InputError(f"is {query.scene[:80]!r}.", field="scene", hint=f"scenes: {', '.join(scene_names())}")
@@ -52,6 +52,7 @@ def pick(
         lift=query.lift,
         force=query.force,
         tries=query.tries,
+        attempts=query.attempts,
         budget_ms=query.budget_ms,
         grasp=GraspOptions(seed=query.seed),
         seed=query.seed,
@@ -79,6 +80,7 @@ def _pick(scene: Scene, query: PicksRequest, options: PickOptions, handle: JobHa
         views=query.views,
         margin=query.margin,
         home=query.home,
+        look=query.look,
         seed=query.seed,
         stop=handle.cancelled.is_set,
         on_step=on_step,

@@ -60,6 +60,7 @@ class MeshStack:
     """TSDF fusion, marching cubes, and python-fcl on the triangles."""
 
     name = "mesh"
+    looks = False
 
     def learn(self, scan: TrialScan) -> StackMap:
         """Implement :meth:`splatbot.sim.trials.stacks.Stack.learn`."""
@@ -85,6 +86,7 @@ class CloudStack:
     """Points with normals, and python-fcl on an octree of them."""
 
     name = "cloud"
+    looks = False
 
     def learn(self, scan: TrialScan) -> StackMap:
         """Implement :meth:`splatbot.sim.trials.stacks.Stack.learn`."""

@@ -17,11 +17,13 @@ import torch
 
 from splatbot.errors import FormatError, InputError, SplatbotError
 from splatbot.sim.trials.scenes import FAMILIES, make_trial
-from splatbot.sim.trials.stacks import GaussianStack, Stack
+from splatbot.sim.trials.stacks import GaussianStack, LookingStack, Stack
 from splatbot.sim.trials.trial import TrialRow, run_trial
 
 FILE = "trials.jsonl"
-STACKS = ("gaussians", "mesh", "cloud")
+STACKS = ("gaussians", "gaussians_look", "mesh", "cloud")
+MOST_MOVED = 0.1
+"""Largest push of a target [m]; it may not reach its neighbours."""
 OnProgress = Callable[[str, float], None]
 
 
@@ -41,6 +43,7 @@ class TrialsPlan:
         jobs: number of processes.
         frames, width: of each scan.
         videos: whether to record videos of failures.
+        moved: distance by which the target is pushed aside after the scan [m].
 
     Raises:
         InputError: a value is out of range, or a name unknown.
@@ -54,6 +57,7 @@ class TrialsPlan:
     frames: int = 32
     width: int = 320
     videos: bool = False
+    moved: float = 0.0
 
     def __post_init__(self) -> None:
         if self.family not in FAMILIES:
@@ -61,6 +65,8 @@ class TrialsPlan:
         unknown = [name for name in self.stacks if name not in STACKS]
         if unknown or not self.stacks:
             raise InputError(f"are {', '.join(self.stacks) or 'none'}.", field="stacks", hint=f"of {', '.join(STACKS)}")
+        if not 0.0 <= self.moved <= MOST_MOVED:
+            raise InputError(f"is {self.moved:g}.", field="moved", hint=f"give metres, 0 to {MOST_MOVED:g}")
         if self.trials < 1 or self.jobs < 1 or self.first < 0 or self.frames < 4 or self.width < 64:
             hint = "give 1 trial and job or more, a seed of 0 or more, 4 frames of 64 pixels or more"
             raise InputError("is out of range.", field="plan", hint=hint)
@@ -79,6 +85,8 @@ def stack_of(name: str) -> Stack:
     """
     if name == "gaussians":
         return GaussianStack()
+    if name == "gaussians_look":
+        return LookingStack()
     if importlib.util.find_spec("fcl") is None:
         raise InputError("needs python-fcl.", field=f"stack {name}", hint="pip install python-fcl")
     from splatbot.sim.trials.peers import CloudStack, MeshStack
@@ -100,8 +108,9 @@ def run_trials(
     """
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / FILE
-    # Rows of another scan resolution belong to other trials, and stay in the file.
-    same = (row for row in read_rows(path) if (row.frames, row.pixels) == (plan.frames, plan.width))
+    # Rows of another scan resolution or another push belong to other trials, and stay in the file.
+    own = (plan.frames, plan.width, plan.moved)
+    same = (row for row in read_rows(path) if (row.frames, row.pixels, row.moved) == own)
     done = {(row.family, row.seed, row.stack): row for row in same}
     for name in plan.stacks:
         stack_of(name)
@@ -185,7 +194,8 @@ def _job(job: Any) -> list[TrialRow]:
     videos = Path(folder) if plan.videos else None
     stacks = [stack_of(name) for name in names]
     try:
-        return run_trial(make_trial(seed, plan.family), stacks, frames=plan.frames, width=plan.width, videos=videos)
+        trial = make_trial(seed, plan.family)
+        return run_trial(trial, stacks, frames=plan.frames, width=plan.width, videos=videos, moved=plan.moved)
     except Exception as error:
         hint = f"the trials before it are in {folder}; --scenes {plan.family} --first {seed} --trials 1 runs it alone"
         raise TrialError(f"failed: {error}", field=f"{plan.family}, seed {seed}", hint=hint) from error

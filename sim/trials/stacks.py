@@ -74,6 +74,11 @@ class Stack(Protocol):
         """Name in tables."""
         ...
 
+    @property
+    def looks(self) -> bool:
+        """Return whether the arm looks again from the wrist before the fingers close."""
+        ...
+
     def learn(self, scan: TrialScan) -> StackMap:
         """Build a map from a scan."""
         ...
@@ -83,6 +88,7 @@ class GaussianStack:
     """The Gaussians of the map, with certified paths."""
 
     name = "gaussians"
+    looks = False
 
     def learn(self, scan: TrialScan) -> StackMap:
         """Implement :meth:`Stack.learn`."""
@@ -112,6 +118,13 @@ class GaussianStack:
         )
 
 
+class LookingStack(GaussianStack):
+    """The same, with a look from the wrist before the fingers close, and further attempts."""
+
+    name = "gaussians_look"
+    looks = True
+
+
 @dataclass(frozen=True, eq=False)
 class StackDecision:
     """A target, its grasps, and the paths to them.
@@ -122,6 +135,7 @@ class StackDecision:
         grasps: of it.
         planner: of paths to the grasps, each planned once.
         seconds: until the ranked list of grasps [s].
+        looks: whether the arm looks again; it then plans with the map alone.
     """
 
     target: Target
@@ -129,9 +143,10 @@ class StackDecision:
     grasps: GraspResult
     planner: PickPlanner
     seconds: float
+    looks: bool = False
 
 
-def decide(known: StackMap, scan: TrialScan) -> StackDecision:
+def decide(known: StackMap, scan: TrialScan, *, looks: bool = False) -> StackDecision:
     """Find the object under the click, and grasps of it.
 
     Raises:
@@ -141,7 +156,7 @@ def decide(known: StackMap, scan: TrialScan) -> StackDecision:
     sampler, planner = known.planners(target)
     begin = time.perf_counter()
     grasps = sampler.sample(target, OPTIONS.grasp)
-    return StackDecision(target, sampler, grasps, _CachedPlanner(planner), time.perf_counter() - begin)
+    return StackDecision(target, sampler, grasps, _CachedPlanner(planner), time.perf_counter() - begin, looks)
 
 
 class _CachedPlanner:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from splatbot.sim.compare.held_out import HeldOutTwin, Spread, draw
 from splatbot.sim.contact_monitor import ContactMonitor
 from splatbot.sim.controller import TwinController
 from splatbot.sim.dressing import dressed
+from splatbot.sim.picking import push_aside
 from splatbot.sim.trials.scan import TrialScan, UnseenError, scan_scene
 from splatbot.sim.trials.scenes import TABLE, TrialScene
 from splatbot.sim.trials.shake import Shake
@@ -31,6 +32,7 @@ from splatbot.sim.trials.stacks import OPTIONS, Stack, StackDecision, StackMap, 
 from splatbot.sim.twin import Twin
 from splatbot.sim.video import Video
 from splatbot.sim.world import OBJECT
+from splatbot.sim.wrist_camera import TwinWristCamera
 
 
 @dataclass(frozen=True)
@@ -107,6 +109,7 @@ class TrialRow:
         world_bytes: size of that map [bytes], or None without one.
         width_mm: of the grasp [mm]. If None, there was no grasp.
         frames, pixels: number of frames of the scan, and their width [px].
+        moved: distance by which the target was pushed aside after the scan [m].
     """
 
     seed: int
@@ -123,6 +126,7 @@ class TrialRow:
     width_mm: float | None
     frames: int
     pixels: int
+    moved: float = 0.0
 
     def to_dict(self) -> dict[str, Any]:
         """Return the row as values for JSON; the held-out twin is ``reality`` there."""
@@ -142,7 +146,13 @@ class TrialRow:
 
 
 def run_trial(
-    trial: TrialScene, stacks: Sequence[Stack], *, frames: int = 32, width: int = 320, videos: Path | None = None
+    trial: TrialScene,
+    stacks: Sequence[Stack],
+    *,
+    frames: int = 32,
+    width: int = 320,
+    videos: Path | None = None,
+    moved: float = 0.0,
 ) -> list[TrialRow]:
     """Scan a scene, and let each stack pick its target. A target that no image shows is a failure of each stack.
 
@@ -151,36 +161,46 @@ def run_trial(
         stacks: the stacks.
         frames, width: of the scan, see :func:`splatbot.sim.trials.scan.scan_scene`.
         videos: folder for videos of picks that failed in the held-out twin. If None, no videos are recorded.
+        moved: distance by which the target is pushed aside after the scan [m].
     """
     try:
         seen = scan_scene(trial, frames=frames, width=width)
     except UnseenError as error:
         both = _no_target(error)
-        return [_row(stack, trial, (frames, width), None, None, None, both, both) for stack in stacks]
-    return [pick_with(stack, trial, seen, videos=videos) for stack in stacks]
+        rows = [_row(stack, trial, (frames, width), None, None, None, both, both) for stack in stacks]
+        return [replace(row, moved=moved) for row in rows]
+    return [replace(pick_with(stack, trial, seen, videos=videos, moved=moved), moved=moved) for stack in stacks]
 
 
-def pick_with(stack: Stack, trial: TrialScene, seen: TrialScan, *, videos: Path | None = None) -> TrialRow:
+def pick_with(
+    stack: Stack, trial: TrialScene, seen: TrialScan, *, videos: Path | None = None, moved: float = 0.0
+) -> TrialRow:
     """Run one stack's pick from a scan in both twins."""
     known = stack.learn(seen)
     scan = len(seen.frames), seen.frames[0].camera.width
     try:
-        decision = decide(known, seen)
+        decision = decide(known, seen, looks=stack.looks)
     except AffordanceError as error:
         both = _no_target(error)
         return _row(stack, trial, scan, known, None, None, both, both)
     results = []
     mistaken = _mistaken(known, decision.target, trial)
     for twin in (Twin(trial.scene), held_out_twin(trial)):
-        results.append(attempt(decision, trial, twin, mistaken=mistaken))
+        results.append(attempt(decision, trial, twin, mistaken=mistaken, moved=moved))
     (ideal, first), (held_out, _) = results
     if videos is not None and not held_out.success:
-        _film(decision, trial, videos / f"{trial.family}-{trial.seed}-{stack.name}.mp4")
+        _film(decision, trial, videos / f"{trial.family}-{trial.seed}-{stack.name}.mp4", moved)
     return _row(stack, trial, scan, known, decision, first, ideal, held_out)
 
 
 def attempt(
-    decision: StackDecision, trial: TrialScene, twin: Twin, *, mistaken: bool = False, watch: Watch | None = None
+    decision: StackDecision,
+    trial: TrialScene,
+    twin: Twin,
+    *,
+    mistaken: bool = False,
+    moved: float = 0.0,
+    watch: Watch | None = None,
 ) -> tuple[TwinPickResult, PickResult]:
     """Run the pick in a twin, then shake.
 
@@ -189,14 +209,20 @@ def attempt(
         trial: the scene.
         twin: of it.
         mistaken: whether the decision is about another object than the trial's target.
+        moved: distance by which the target is pushed aside first [m].
         watch: called with MuJoCo's data and the time [s] after every control period.
     """
+    if moved > 0.0:
+        push_aside(twin, trial.target, moved, trial.seed)
     controller = _Watched(twin, watch)
     assert controller.gripper is not None
     before = _height(twin, trial.target)
-    picker = Picker(
-        decision.sampler, controller, controller.gripper, options=OPTIONS, make_planner=lambda target: decision.planner
-    )
+    parts = (decision.sampler, controller, controller.gripper)
+    if decision.looks:
+        camera = TwinWristCamera(twin, T_world_base=decision.sampler.scene.T_world_base, seed=trial.seed)
+        picker = Picker(*parts, options=OPTIONS, camera=camera)
+    else:
+        picker = Picker(*parts, options=OPTIONS, make_planner=lambda target: decision.planner)
     result = picker.pick(decision.target, grasps=decision.grasps)
     rose = _height(twin, trial.target) - before
     early = controller.touched(trial.target)
@@ -245,12 +271,12 @@ def held_out_twin(trial: TrialScene) -> HeldOutTwin:
     return HeldOutTwin(trial.scene, draw(Spread(), trial.seed))
 
 
-def _film(decision: StackDecision, trial: TrialScene, path: Path) -> None:
+def _film(decision: StackDecision, trial: TrialScene, path: Path, moved: float) -> None:
     """Record the pick in the held-out twin again, with a camera."""
     twin = held_out_twin(trial)
     video = Video(path, TwinCamera(dressed(twin.world), seed=trial.seed))
     try:
-        attempt(decision, trial, twin, watch=video)
+        attempt(decision, trial, twin, moved=moved, watch=video)
     finally:
         video.close()
 

@@ -21,6 +21,7 @@ def trials(
     jobs: int = 1,
     frames: int = 32,
     width: int = 320,
+    moved: float = 0.0,
     videos: bool = False,
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
     quiet: bool = False,
@@ -32,7 +33,8 @@ def trials(
     twin with other friction, masses, gains and delays and every effect ("reality"). It succeeds if the hand lifts the
     object by 15 cm and still holds it after shaking. All stacks get the same frames at the same poses.
 
-    Stacks: gaussians (the map), mesh (fused depth, marching cubes, python-fcl), cloud (points, an octree, python-fcl).
+    Stacks: gaussians (the map), gaussians_look (the same, and a look from the wrist before the fingers close), mesh
+    (fused depth, marching cubes, python-fcl), cloud (points, an octree, python-fcl).
 
     Writes a line of trials.jsonl for each stack in each scene. A second run continues an interrupted one. Writes
     trials.json with the table and the physics that it holds for.
@@ -40,6 +42,7 @@ def trials(
     Examples:
         splatbot trials --jobs 2
         splatbot trials --scenes isolated --trials 24 --out runs/isolated
+        splatbot trials --moved 0.02 --stacks gaussians gaussians_look --out runs/moved
         splatbot trials --full --stacks gaussians mesh cloud --jobs 2 --out runs/trials
 
     Args:
@@ -47,11 +50,12 @@ def trials(
             object.
         trials: number of scenes; by default 50, or 24 with isolated objects.
         full: run 250 scenes.
-        stacks: stacks to compare: gaussians, mesh, cloud.
+        stacks: stacks to compare: gaussians, gaussians_look, mesh, cloud.
         first: seed of the first scene.
         jobs: number of processes.
         frames: frames of each scan.
         width: width of its images [px].
+        moved: distance by which the target is pushed aside after the scan, as by a person [m].
         videos: write a video of each pick that failed in reality.
         out: folder to write to; by default runs/trials.
         quiet: print only errors.
@@ -67,13 +71,14 @@ def trials(
     from splatbot.sim.trials.table import physics, summaries
 
     count = trials if trials is not None else 250 if full else 24 if scenes == "isolated" else 50
-    plan = TrialsPlan(scenes, count, stacks, first, jobs, frames, width, videos)
+    plan = TrialsPlan(scenes, count, stacks, first, jobs, frames, width, videos, moved)
     folder = out if out is not None else Path("runs") / "trials"
     with shares(quiet) as tell:
         rows, interrupted = run_trials(plan, folder, on_progress=tell)
     found = summaries(rows)
     values = {
         "scenes": scenes,
+        "moved_m": moved,
         "interrupted": interrupted,
         "physics": physics(make_trial(first, scenes)),
         "stacks": found,

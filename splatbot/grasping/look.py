@@ -14,6 +14,7 @@ import numpy as np
 import open3d as o3d
 from scipy.spatial import cKDTree
 
+from splatbot.collision import GaussianCollisionField
 from splatbot.collision.visibility import DepthView, measured_depths
 from splatbot.geometry import inverse, transform_points
 from splatbot.grasping.hands import Hands
@@ -41,6 +42,7 @@ class LookConstants:
         support: [m] depth so close to a support is of the support.
         facing: least cosine between the normal of a surface point and the direction to the camera.
         around: [m] radius around the tool in which depth may be in the hand.
+        new: [m] depth so far from the map is of something new; edge of the cells that it fills.
         neighbours: least number of other points within ``close`` of a point in the hand.
         gone: [m] depth so far behind a surface point shows that it is gone.
         min_gone: least share of the surface points that must be gone after a lift.
@@ -60,6 +62,7 @@ class LookConstants:
     support: float = 0.005
     facing: float = 0.2
     around: float = 0.3
+    new: float = 0.01
     neighbours: int = 4
     gone: float = 0.015
     min_gone: float = 0.5
@@ -141,6 +144,26 @@ def relocate(scene: SegmentedMap, surface: GraspSurface, view: DepthView) -> Rel
     for fit in (shifted, _fit(_turned(source, target, shifted.T), source, tree, view)):
         best = fit if fit.rms < CONSTANTS.tie * best.rms else best
     return _judged(best, middle)
+
+
+def unexplained(scene: SegmentedMap, field: GaussianCollisionField, view: DepthView) -> Array:
+    """Return balls (V, 4) = (x, y, z, radius) [m, world] around depth that neither the map nor a support explains.
+
+    Args:
+        scene: the segmented map.
+        field: collision field of the whole map.
+        view: the depth image, without the arm.
+    """
+    points = _points(view)
+    own = transform_points(inverse(scene.T_world_base), points)
+    new = np.ones(len(points), np.bool_)
+    for support in scene.supports:
+        new &= np.abs(support.height(own)) > CONSTANTS.new
+    points = points[new]
+    points = points[field.clearance(points, cut=CONSTANTS.new).distance >= CONSTANTS.new]
+    cells, count = np.unique(np.floor(points / CONSTANTS.new).astype(np.int64), axis=0, return_counts=True)
+    cells = cells[count > CONSTANTS.neighbours]
+    return np.c_[(cells + 0.5) * CONSTANTS.new, np.full(len(cells), np.sqrt(3.0) / 2 * CONSTANTS.new)]
 
 
 def in_the_way(hands: Hands, hand: HandShape, view: DepthView, retreat: float) -> float:

@@ -1,4 +1,4 @@
-"""A target, its map and its grasps after a rigid motion of the target."""
+"""Changes of the map that a look from the wrist shows: a target that moved, and things that are new."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from splatbot.collision.moving import with_balls
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import quat_multiply, rotation_to_quat, transform_points
 from splatbot.grasping.sampler import GraspSampler
@@ -27,6 +28,18 @@ def moved_sampler(sampler: GraspSampler, rows: NDArray[np.int64], T_now_before: 
     found = copy.copy(sampler)
     found.scene = replace(sampler.scene, model=moved_rows(sampler.scene.model, rows, T_now_before))
     found.field = found.collision_field(found.scene.model)
+    return found
+
+
+def with_obstacles(sampler: GraspSampler, balls: Array) -> GraspSampler:
+    """Return the sampler on a map with additional balls (V, 4) = (x, y, z, radius) [m, world]."""
+    found = copy.copy(sampler)
+    model = with_balls(sampler.scene.model, balls, n_sigma=sampler.n_sigma, observations=sampler.min_observations)
+    labels = np.concatenate([sampler.scene.labels, np.full(len(balls), -1, np.int32)])
+    found.scene = replace(sampler.scene, model=model, labels=labels)
+    if sampler.observers is not None:
+        found.observers = np.concatenate([sampler.observers, np.full((len(balls), 3), np.nan)])
+    found.field = found.collision_field(model)
     return found
 
 

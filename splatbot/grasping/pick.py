@@ -12,7 +12,8 @@ from splatbot.errors import GripperError, InputError, SplatbotError
 from splatbot.grasping.affordance import Target
 from splatbot.grasping.hands import Hands
 from splatbot.grasping.look import CONSTANTS as LOOK
-from splatbot.grasping.look import WristCamera, in_the_way, relocate, share_gone
+from splatbot.grasping.look import WristCamera, in_the_way, relocate, share_gone, unexplained
+from splatbot.grasping.moved_target import with_obstacles
 from splatbot.grasping.pick_planner import MapPickPlanner, PickPlan, PickPlanner, Segment
 from splatbot.grasping.pick_types import PickOptions, PickOutcome, PickResult, PickStage, PickStep
 from splatbot.grasping.sampler import GraspSampler
@@ -49,8 +50,9 @@ class Picker:
     Fingers that hold an object keep it; fingers that closed without an object open again.
 
     With a wrist camera the loop is closed. At the pre-grasp the arm looks again. If the target moved by up to 5 cm, it
-    plans to the new place; if something is in the way, it tries the next grasp. After the lift it looks whether the
-    place is empty. If the fingers hold nothing, or something of another width, it goes back and tries the next grasp.
+    plans to the new place. If something is in the way, that becomes an obstacle, and the next grasp is tried. After the
+    lift it looks whether the place is empty. If the fingers hold nothing, or something of another width, it goes back
+    and tries the next grasp.
 
     Args:
         sampler: grasp sampler with the map, the robot and its base pose.
@@ -211,7 +213,11 @@ class _Pick:
         hand = Hands.one(plan.grasp.T_world_tcp, plan.opening)
         deep = in_the_way(hand, self.s.hand, view, retreat)
         if deep > LOOK.max_penetration:
-            raise _MissedError(PickOutcome.OBSTRUCTED, f"depth is {1e3 * deep:.1f} mm deep in the hand on its way")
+            balls = unexplained(self.s.scene, self.s.field, view)
+            self.s = with_obstacles(self.s, balls)
+            self.planner = MapPickPlanner(self.s, self.target, self.o)
+            reason = f"depth is {1e3 * deep:.1f} mm deep in the hand on its way; {len(balls)} obstacles are new"
+            raise _MissedError(PickOutcome.OBSTRUCTED, reason)
         if found.still:
             self._done(f"in its place; {agrees}")
         return plan
