@@ -33,8 +33,8 @@ def trials(
     twin with other friction, masses, gains and delays and every effect ("reality"). It succeeds if the hand lifts the
     object by 15 cm and still holds it after shaking. All stacks get the same frames at the same poses.
 
-    Stacks: gaussians (the map), gaussians_look (the same, and a look from the wrist before the fingers close), mesh
-    (fused depth, marching cubes, python-fcl), cloud (points, an octree, python-fcl).
+    Stacks: gaussians (the map), gaussians_look (with a look from the wrist), mesh (fused depth, marching cubes,
+    python-fcl), cloud (points, an octree, python-fcl).
 
     Writes a line of trials.jsonl for each stack in each scene. A second run continues an interrupted one. Writes
     trials.json with the table and the physics that it holds for.

@@ -1,4 +1,4 @@
-"""A look from the wrist before the fingers close: where the target is now, what is in the way, and whether it is gone.
+"""A look from the wrist: the pose of the target before the fingers close, obstacles of the hand, and the empty place.
 
 The map is some seconds old when the hand arrives. One depth image at the pre-grasp shows whether the target moved, and
 one after the lift whether its place is empty.
@@ -112,8 +112,8 @@ class Relocation:
 def relocate(scene: SegmentedMap, surface: GraspSurface, view: DepthView) -> Relocation:
     """Find a target in one depth image, near the place where it was mapped.
 
-    1. The surface points that face the camera are registered to the depth by point-to-plane ICP (Chen and Medioni
-       1992), first by shifts alone, from nine offsets in the plane of the support.
+    1. Point-to-plane ICP (Chen and Medioni 1992) registers the surface points that face the camera to the depth. It
+       estimates shifts alone, from nine offsets in the plane of the support.
     2. From the best shift, ICP with Tukey weights estimates a turn too. It counts only if it improves the fit, because
        round objects have no angle.
     3. Changes within noise count as none, and large ones as another object.

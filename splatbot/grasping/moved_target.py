@@ -1,4 +1,4 @@
-"""Changes of the map that a look from the wrist shows: a target that moved, and things that are new."""
+"""Changes of the map that a look from the wrist shows: a target that moved, and new obstacles."""
 
 from __future__ import annotations
 

@@ -39,6 +39,20 @@ def test_a_can_is_taken_and_the_twin_says_how_far_it_rose(run: RunCommand, scene
     assert abs(written["rose_m"]["slab"]) < 0.002
 
 
+def test_a_can_that_was_pushed_aside_after_the_scan_is_looked_for_and_taken(
+    run: RunCommand, scene: Path, tmp_path: Path
+) -> None:
+    answer = run("pick", scene, "--target", "can", "--moved", 0.03, "--out", tmp_path / "out")
+    assert answer.code == 0, answer.err
+    written = json.loads((tmp_path / "out" / "pick.json").read_text())
+    assert written["shift_m"] == pytest.approx(0.03, abs=0.004)
+    assert written["attempts"] == 1
+    assert written["rose_m"]["can"] == pytest.approx(0.15, abs=0.01)
+    assert "look" in answer.out
+    assert run("pick", scene, "--target", "can", "--moved", 0.03, "--no-look", "--out", tmp_path / "blind").code == 1
+    assert run("pick", scene, "--target", "can", "--moved", 0.3).code == 2
+
+
 def test_an_object_that_is_too_wide_has_no_grasp_and_nothing_moves(
     run: RunCommand, scene: Path, tmp_path: Path
 ) -> None:

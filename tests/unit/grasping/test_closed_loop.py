@@ -112,7 +112,7 @@ class Scene:
 
 
 class MissesOnce(FakeGripper):
-    """Fingers that close beside the object in the first attempt."""
+    """Fingers that miss the object in the first attempt."""
 
     def __init__(self, wrong: float) -> None:
         super().__init__(width=wrong)

@@ -1,4 +1,4 @@
-"""A look from the wrist against true motions of the target in MuJoCo, round and flat-sided, and what it must refuse."""
+"""A look from the wrist against true motions of round and flat-sided targets in MuJoCo, and the views it refuses."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from splatbot.collision.visibility import DepthView
 from splatbot.errors import InputError
 from splatbot.geometry import inverse, look_at, se3_exp, transform_points
 from splatbot.grasping.hands import Hands
-from splatbot.grasping.look import CONSTANTS, in_the_way, relocate, share_gone
-from splatbot.grasping.moved_target import moved_rows, moved_sampler
+from splatbot.grasping.look import CONSTANTS, in_the_way, relocate, share_gone, unexplained
+from splatbot.grasping.moved_target import moved_rows, moved_sampler, with_obstacles
 from splatbot.protocols import Array
 from splatbot.sim.rays import cast, pixel_rays
 from splatbot.sim.scene import make_scene
@@ -116,6 +116,22 @@ def test_depth_between_hand_and_grasp_is_in_the_way_but_single_pixels_are_not() 
     assert in_the_way(hands, hand, (flying, camera, T_world_camera), 0.05) == 0.0
     flying[v - 2 : v + 3, u - 2 : u + 3] = p[2]
     assert in_the_way(hands, hand, (flying, camera, T_world_camera), 0.05) > CONSTANTS.max_penetration
+
+
+def test_what_the_map_does_not_explain_becomes_balls_around_its_depth() -> None:
+    center = sampler().surface(target("can")).center
+    same, _ = moved("can", 0.0, 0.0, 0.0)
+    assert len(unexplained(scene(), sampler().field, view(same, center))) <= 3  # edges at most
+    there, _ = moved("ball", -0.17, -0.40, 0.0)  # next to the can, where the map is empty
+    balls = unexplained(scene(), sampler().field, view(there, center))
+    near = np.linalg.norm(balls[:, :3] - there.data.body("object/ball").xpos, axis=1)
+    assert (near < 0.05).sum() > 20
+    assert (near < 0.05).mean() > 0.9
+    more = with_obstacles(sampler(), balls)
+    assert len(more.scene.labels) == len(more.scene.model) == len(scene().model) + len(balls)
+    assert sampler().field.clearance(balls[:, :3], cut=0.05).distance.min() > 0.0
+    inside = more.field.clearance(balls[:, :3], cut=0.05).distance
+    np.testing.assert_allclose(inside, -balls[:, 3], atol=2e-3)
 
 
 def test_a_place_is_empty_once_the_object_is_lifted_and_unknown_where_it_is_hidden() -> None:
