@@ -72,6 +72,9 @@ class LookConstants:
 CONSTANTS = LookConstants()
 
 
+_HIDDEN = "the image does not show it"
+
+
 class WristCamera(Protocol):
     """A depth camera that the arm carries."""
 
@@ -94,6 +97,7 @@ class Relocation:
         share: share of the shown surface points that agree with depth.
         points: number of surface points that the image shows.
         reason: why the target was not found; empty if it was.
+        shown: whether the image shows enough of the place.
     """
 
     T_now_before: Array
@@ -102,6 +106,7 @@ class Relocation:
     share: float
     points: int
     reason: str = ""
+    shown: bool = True
 
     @property
     def still(self) -> bool:
@@ -115,7 +120,7 @@ def relocate(scene: SegmentedMap, surface: GraspSurface, view: DepthView) -> Rel
     1. Point-to-plane ICP (Chen and Medioni 1992) registers the surface points that face the camera to the depth. It
        estimates shifts alone, from nine offsets in the plane of the support.
     2. From the best shift, ICP with Tukey weights estimates a turn too. It counts only if it improves the fit, because
-       round objects have no angle.
+       round objects have no angle, and is at most 25 degrees.
     3. Changes within noise count as none, and large ones as another object.
 
     Args:
@@ -134,14 +139,15 @@ def relocate(scene: SegmentedMap, surface: GraspSurface, view: DepthView) -> Rel
     cosine = (surface.normals * to_camera).sum(axis=1) / np.linalg.norm(to_camera, axis=1)
     source = surface.points[surface.observed & (cosine > CONSTANTS.facing)]
     if len(source) < CONSTANTS.min_points or len(seen) < CONSTANTS.min_points:
-        return Relocation(np.eye(4), 0.0, 0.0, 0.0, min(len(source), len(seen)), "the image does not show it")
+        return Relocation(np.eye(4), 0.0, 0.0, 0.0, min(len(source), len(seen)), _HIDDEN, shown=False)
     target = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(seen)).voxel_down_sample(CONSTANTS.voxel)
     target.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(radius=4 * CONSTANTS.voxel, max_nn=20))
     tree = cKDTree(np.asarray(target.points))
     shifts = _shifted(source, tree, np.asarray(target.normals), scene.up)
     shifted = min((_fit(T, source, tree, view) for T in shifts), key=lambda fit: fit.rms)
     best = _fit(np.eye(4), source, tree, view)
-    for fit in (shifted, _fit(_turned(source, target, shifted.T), source, tree, view)):
+    turned = _fit(_turned(source, target, shifted.T), source, tree, view)
+    for fit in (shifted, turned) if _angle(turned.T) <= CONSTANTS.max_turn else (shifted,):
         best = fit if fit.rms < CONSTANTS.tie * best.rms else best
     return _judged(best, middle)
 
@@ -264,8 +270,8 @@ def _judged(fit: _Fit, middle: Array) -> Relocation:
     shift, turn = float(np.linalg.norm(transform_points(T, middle) - middle)), _angle(T)
     reason = ""
     if points < CONSTANTS.min_points:
-        reason = "the image does not show it"
-    elif share < CONSTANTS.min_share:
+        return Relocation(np.eye(4), 0.0, 0.0, share, points, _HIDDEN, shown=False)
+    if share < CONSTANTS.min_share:
         reason = f"only {100 * share:.0f} % of its surface agrees with depth"
     elif shift > CONSTANTS.max_shift or turn > CONSTANTS.max_turn:
         reason = f"it moved by {1e3 * shift:.0f} mm and {np.degrees(turn):.0f} degrees"

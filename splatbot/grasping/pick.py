@@ -202,6 +202,8 @@ class _Pick:
         self.stage = PickStage.LOOK
         view = camera.look()
         found = relocate(self.s.scene, self.s.surface(self.target), view)
+        if not found.shown:  # another grasp may look from another side
+            raise _MissedError(PickOutcome.TARGET_MOVED, found.reason)
         if found.reason:
             raise _EndedError(PickOutcome.TARGET_MOVED, found.reason)
         self.shift = found.shift
