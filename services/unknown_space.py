@@ -26,7 +26,7 @@ def field_with_unknown(
 ) -> Callable[[float], GaussianCollisionField]:
     """Return a function of the margin [m] that gives the field of a map with its unknown space under a policy.
 
-    The search for unknown space takes seconds, once for each map version and robot.
+    The search for unknown space takes seconds, once for each map version and robot. :func:`check_unknown` comes first.
 
     Args:
         served: the map.
@@ -34,9 +34,6 @@ def field_with_unknown(
         robot: the arm.
         T_world_base: (4, 4) pose of the map's base. Bases of requests would make each request a search.
         start: (J,) configuration at which the arm is [rad or m]; the space that it fills is no obstacle.
-
-    Raises:
-        InputError: the policy needs a recording, and the map has none.
     """
     field = served.field
     if policy == "free":
@@ -55,7 +52,7 @@ def unknown_field(
 ) -> GaussianCollisionField | None:
     """Return the field of unknown space alone, for an arm that is at home; None if it is free.
 
-    For arguments and errors see :func:`field_with_unknown`.
+    For the arguments see :func:`field_with_unknown`.
     """
     if policy == "free":
         return None
@@ -63,23 +60,31 @@ def unknown_field(
     return field_of(_space(served, arm), policy, arm, robot.home, margin=margin)
 
 
-def refuse_other_bases(policy: UnknownPolicy, given: Pose | None) -> None:
-    """Check that a request with unknown space is for the base of the map.
+def check_unknown(served: ServedMap, policy: UnknownPolicy, given: Pose | None) -> None:
+    """Check, before any work, that unknown space can be found for a request.
+
+    Args:
+        served: the map.
+        policy: treatment of unknown space.
+        given: base of the request. If None, it is that of the map.
 
     Raises:
-        InputError: it gives its own base, which would make each request a search of seconds.
+        InputError: the map has no recording, or the request gives a base, which would make each one a search.
     """
-    if policy != "free" and given is not None:
+    if policy == "free":
+        return
+    if served.run is None:
+        raise InputError(
+            f"needs depth images, and map {served.id!r} has no recording.",
+            field="unknown",
+            hint='give "free", or map a recording',
+        )
+    if given is not None:
         hint = "write the base into the scene.yaml of the map, or leave unknown space free"
         raise InputError("is given, but unknown space is known for the base of the map.", field="base", hint=hint)
 
 
 def _space(served: ServedMap, arm: RobotSpheres) -> UnknownSpace:
     run = served.run
-    if run is None:
-        raise InputError(
-            f"needs depth images, and map {served.id!r} has no recording.",
-            field="unknown",
-            hint='give "free", or map a recording',
-        )
+    assert run is not None  # by check_unknown
     return served.derived.get(("unknown space", arm.robot.name), lambda: unknown_in_reach(run, reopen_log(run), arm))

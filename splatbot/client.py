@@ -251,7 +251,7 @@ class Client(AbstractContextManager["Client"]):
             scene: name of the scene.
             target: name of an object in the scene, or a description in words.
             key: Idempotency-Key; a repeated request with the same key returns the same job.
-            more: views, lift, force, tries, budget_ms, margin, home, seed.
+            more: views, lift, force, tries, budget_ms, margin, home, look, attempts, seed.
         """
         return self._json("POST", "/v1/picks", {"scene": scene, "target": target, **more}, _idempotency(key))
 

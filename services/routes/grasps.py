@@ -22,7 +22,7 @@ from splatbot.services.margins import MarginSource, margin_source
 from splatbot.services.robots_in_maps import base_in, objects_in
 from splatbot.services.schemas import GraspsRequest
 from splatbot.services.topics import GRASPS
-from splatbot.services.unknown_space import refuse_other_bases, unknown_field
+from splatbot.services.unknown_space import check_unknown, unknown_field
 
 router = APIRouter(prefix="/v1/maps", tags=["grasping"])
 
@@ -61,7 +61,7 @@ def grasps(request: Request, served: ServedAfterFrames, service: Service, query:
     Words match names, colours, shapes, sizes and places; an ambiguous description is refused.
     """
     robot, base = known_robot(query.robot), base_in(served, query.base)
-    refuse_other_bases(query.unknown, query.base)
+    check_unknown(served, query.unknown, query.base)
     objects = objects_in(served, base, as_known=query.base is None)
     found = find_target(_hint(query), objects.scene, [LanguageAffordance(), SpatialAffordance()])
     sampler = objects.sampler(robot, hand_only=query.hand_only, min_observations=query.min_observations)

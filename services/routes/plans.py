@@ -20,7 +20,7 @@ from splatbot.services.problems import TooLargeError
 from splatbot.services.robots_in_maps import arm_in, base_in, joints_of
 from splatbot.services.schemas import BASE_EXAMPLE, IkRequest, PlanRequest
 from splatbot.services.topics import PLAN
-from splatbot.services.unknown_space import field_with_unknown, refuse_other_bases
+from splatbot.services.unknown_space import check_unknown, field_with_unknown
 
 router = APIRouter(tags=["motion"])
 
@@ -75,7 +75,7 @@ def plan(request: Request, served: ServedAfterFrames, service: Service, query: _
         if query.goal_pose is not None
         else JointGoal(joints_of(robot, query.goal or [], "goal"))
     )
-    refuse_other_bases(query.unknown, query.base)
+    check_unknown(served, query.unknown, query.base)
     source = margin_source(served, query.margin)
     field_at = field_with_unknown(served, query.unknown, robot, base, start)
     found = plan_with_margin(

@@ -129,6 +129,18 @@ def test_the_margin_of_grasps_is_the_error_of_their_own_field(service: Service, 
     assert margin_source(served, None, thin).error is source.error  # audited once
 
 
+def test_grasps_take_the_unknown_space_of_plans(service: Service) -> None:
+    def grasps(name: str, **request: Any) -> Any:
+        return service.client.post(f"/v1/maps/{name}/grasps", json={"point": [0.0, 0.0, 1.0], "samples": 10} | request)
+
+    elsewhere = grasps("placed", base=FAR, unknown="cautious")
+    assert (elsewhere.status_code, elsewhere.json()["field"]) == (422, "base")
+    refused = grasps("bare", unknown="occupied", point=wall().model.means[0].tolist())
+    assert (refused.status_code, refused.json()["field"]) == (422, "unknown")
+    assert "has no recording" in refused.json()["detail"]
+    assert grasps("placed", unknown="maybe").status_code == 422
+
+
 @pytest.mark.parametrize("margin", [-0.1, "much", "1e400", float("1e300"), True])
 def test_margins_that_make_no_sense_are_refused(service: Service, margin: Any) -> None:
     assert plan(service, "table", margin=margin).status_code == 422

@@ -28,10 +28,17 @@ def test_a_pick_is_a_job_that_tells_its_stages_and_how_far_the_thing_rose(robot:
     result = ended["result"]
     assert (result["outcome"], result["stage"]) == ("picked", "check")
     stages = [step["stage"] for step in result["steps"]]
-    assert stages == ["grasp", "plan", "open", "move", "approach", "close", "lift", "lift", "check"]
+    assert stages == ["grasp", "plan", "open", "move", "look", "approach", "close", "lift", "lift", "check"]
+    assert (result["attempts"], result["shift_m"]) == (1, 0.0)
     assert {text.partition(":")[0] for text in told} & set(stages)
     assert result["rose_m"]["can"] == pytest.approx(0.15, abs=0.03)
     assert all(abs(by) < 0.02 for name, by in result["rose_m"].items() if name != "can")
+
+
+def test_a_pick_without_a_look_has_no_such_stage(robot: Client) -> None:
+    ended = robot.wait(robot.pick(SCENE, "can", look=False, attempts=1)["id"])
+    assert "look" not in [step["stage"] for step in ended["result"]["steps"]]
+    assert ended["result"]["shift_m"] is None
 
 
 def test_a_pick_is_cancelled_before_anything_is_lifted(robot: Client) -> None:
@@ -53,6 +60,7 @@ def test_a_thing_that_is_not_there_fails_the_job_with_the_names_that_are(robot: 
         ({"scene": "/etc/hosts"}, "scene", 422),
         ({"budget_ms": 1e9}, "budget_ms", 413),
         ({"lift": 0.01}, "lift", 422),
+        ({"attempts": 0}, "attempts", 422),
         ({"target": "x" * 300}, "target", 422),
     ],
 )

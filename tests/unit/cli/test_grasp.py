@@ -78,6 +78,13 @@ def test_a_point_and_the_hand_alone(run: RunCommand, map_file: Path, tmp_path: P
     assert "near" in best["terms"]
 
 
+def test_unknown_space_needs_the_frames_of_a_run(run: RunCommand, map_file: Path, tmp_path: Path) -> None:
+    words = ("--target", "red box", "--unknown", "cautious", "--out", tmp_path / "out")
+    answer = run("grasp", "--map", map_file, *BASE, *words)
+    assert answer.code == 2
+    assert "--unknown: needs a run folder" in answer.err
+
+
 def test_what_cannot_be_grasped_is_said_counted_and_drawn(run: RunCommand, map_file: Path, tmp_path: Path) -> None:
     answer = run("grasp", "--map", map_file, *BASE, "--target", "largest box", "--out", tmp_path / "out")
     assert answer.code == 1

@@ -193,6 +193,26 @@ def test_an_error_ends_the_run_with_the_name_of_its_trial_and_those_before_it_ar
     assert [kept.seed for kept in read_rows(tmp_path / FILE)] == [2, 3]
 
 
+def test_a_pushed_target_is_another_trial_and_the_look_another_stack(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[tuple[float, list[str]]] = []
+
+    def told(trial: TrialScene, stacks: list[GaussianStack], *, moved: float, **_: object) -> list[TrialRow]:
+        asked.append((moved, [stack.name for stack in stacks]))
+        return [replace(row(trial.seed, stack.name), moved=moved) for stack in stacks]
+
+    monkeypatch.setattr("splatbot.sim.trials.run.run_trial", told)
+    still = TrialsPlan(trials=1, stacks=("gaussians",))
+    both = TrialsPlan(trials=1, stacks=("gaussians", "gaussians_look"), moved=0.02)
+    for plan in (still, both, both, still):
+        rows, _ = run_trials(plan, tmp_path)
+        assert {one.moved for one in rows} == {plan.moved}
+    assert asked == [(0.0, ["gaussians"]), (0.02, ["gaussians", "gaussians_look"])]  # none twice
+    with pytest.raises(InputError, match="moved"):
+        TrialsPlan(moved=0.2)
+
+
 def test_wrong_plans_are_named() -> None:
     for values, word in (({"stacks": ("voxels",)}, "voxels"), ({"family": "zoo"}, "zoo"), ({"trials": 0}, "range")):
         with pytest.raises(InputError, match=word):
