@@ -201,6 +201,9 @@ class PlanRequest(Request):
         description='space that no frame observed: "occupied" is all of it, "cautious" where two frames looked and '
         "measured no depth. Needs a recording, the base of the map, and seconds for the first plan of a robot",
     )
+    support: bool = Field(
+        True, description="the support plane of the map's scene.yaml is an obstacle, also where no frame saw it"
+    )
     budget_ms: Annotated[float, Field(gt=0, allow_inf_nan=False)] = Field(100.0, description="time to plan")
     seed: Annotated[int, Field(ge=0, lt=2**32)] = Field(0, description="seed of the search")
     speed: Annotated[float, Field(gt=0, le=1)] = Field(

@@ -19,6 +19,7 @@ from splatbot.results.margin import CONSTANTS as MARGIN
 from splatbot.robots.robot import RobotModel
 from splatbot.services.arms import known_robot
 from splatbot.services.margins import margin_source, plan_with_margin
+from splatbot.services.plan_obstacles import plan_obstacles
 from splatbot.services.ros.graph import RosGraph, Service
 from splatbot.services.ros.messages import MAP_FRAME
 from splatbot.services.ros.requests import entries, entry, has_content, joints, number, pose, vector
@@ -86,9 +87,10 @@ class MoveItServices:
             # 0 means "not set" in MoveIt, whose own default is 0.1
             speed = number(request, "max_velocity_scaling_factor") or DEFAULT_SPEED
             acceleration = number(request, "max_acceleration_scaling_factor") or DEFAULT_SPEED
+            around = plan_obstacles(served, robot, base, start)
             found = plan_with_margin(
                 margin_source(served, None),
-                lambda margin: GaussianRRTStar(served.field, robot, T_world_base=base, margin=margin),
+                lambda margin: GaussianRRTStar(around.field(margin), robot, T_world_base=base, margin=margin),
                 lambda planner: planner.plan(start, goal, budget_ms=budget),
                 start,
                 goal,
@@ -96,6 +98,7 @@ class MoveItServices:
                 speed=speed,
                 acceleration=acceleration,
             )
+            around.check(found.result)
             found.result.unwrap()
             trajectory = found.trajectory
             assert trajectory is not None

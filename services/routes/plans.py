@@ -10,17 +10,16 @@ from fastapi import APIRouter, Depends, Path, Request, Response
 from splatbot.geometry import inverse
 from splatbot.planning import GaussianRRTStar, JointGoal, PoseGoal
 from splatbot.planning.ik import solve_ik
-from splatbot.results.unknown import refuse_unknown
 from splatbot.services.arms import known_robot
 from splatbot.services.codecs import answer, answers, body_of, request_body
 from splatbot.services.dependencies import ServedAfterFrames, Service, problems
 from splatbot.services.margins import margin_source, plan_with_margin
+from splatbot.services.plan_obstacles import check_unknown, plan_obstacles
 from splatbot.services.plans import Plan
 from splatbot.services.problems import TooLargeError
 from splatbot.services.robots_in_maps import arm_in, base_in, joints_of
 from splatbot.services.schemas import BASE_EXAMPLE, IkRequest, PlanRequest
 from splatbot.services.topics import PLAN
-from splatbot.services.unknown_space import check_unknown, field_with_unknown
 
 router = APIRouter(tags=["motion"])
 
@@ -42,7 +41,14 @@ _ANSWER = {
     "clearance_m": 0.05,
     "margin_m": 0.006,
     "margin_source": "audited error of the map where the arm moves",
-    "covers": {"n_sigma": 2.0, "self_collision": True, "base": False, "unknown_space": "free", "region_points": 5831},
+    "covers": {
+        "n_sigma": 2.0,
+        "self_collision": True,
+        "base": False,
+        "support_plane": True,
+        "unknown_space": "free",
+        "region_points": 5831,
+    },
     "waypoints": [[0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785], [0.3, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785]],
     "trajectory": {"joint_names": ["panda_joint1"], "points": []},
 }
@@ -77,10 +83,10 @@ def plan(request: Request, served: ServedAfterFrames, service: Service, query: _
     )
     check_unknown(served, query.unknown, query.base)
     source = margin_source(served, query.margin)
-    field_at = field_with_unknown(served, query.unknown, robot, base, start)
+    around = plan_obstacles(served, robot, base, start, policy=query.unknown, support=query.support)
     found = plan_with_margin(
         source,
-        lambda margin: GaussianRRTStar(field_at(margin), robot, T_world_base=base, margin=margin),
+        lambda margin: GaussianRRTStar(around.field(margin), robot, T_world_base=base, margin=margin),
         lambda planner: planner.plan(start, goal, budget_ms=query.budget_ms, seed=query.seed),
         start,
         goal,
@@ -88,7 +94,7 @@ def plan(request: Request, served: ServedAfterFrames, service: Service, query: _
         speed=query.speed,
     )
     result, trajectory = found.result, found.trajectory
-    refuse_unknown(result, len(served.ready.model), query.unknown)
+    around.check(result)
     result.unwrap()
     assert trajectory is not None
     points = len(trajectory.control) - 2 if query.rate is None else trajectory.duration * query.rate
@@ -100,7 +106,8 @@ def plan(request: Request, served: ServedAfterFrames, service: Service, query: _
             field="rate",
             hint=hint,
         )
-    covers = found.scope(n_sigma=served.field.n_sigma, unknown=query.unknown, confidence=query.confidence)
+    scope = found.scope(n_sigma=served.field.n_sigma, unknown=query.unknown, confidence=query.confidence)
+    covers = scope | {"map_gaussians": len(served.ready.model), "support_plane": around.covers_support}
     kept = service.plans.add(served, robot.name, base, result, trajectory, source.why, covers)
     service.store.tell(served, PLAN, trajectory)
     return answer(request, _description(kept, query.rate))

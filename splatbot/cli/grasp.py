@@ -295,16 +295,21 @@ def _agree_with_plans(sampler: GraspSampler, map_: Path, arm: RobotModel, policy
     """
     from splatbot.collision import GaussianCollisionField, RobotSpheres
     from splatbot.gaussians import GaussianModel
+    from splatbot.results.plan_obstacles import PlanObstacles
     from splatbot.results.unknown import field_of, unknown_in_reach
     from splatbot.robots.in_view import reopen_log
+    from splatbot.workspace import find_workspace
 
-    solids = None
+    solids, most = None, max(sampler.margin, sampler.arm_margin)
+    spheres = RobotSpheres(arm, T_world_base=sampler.scene.T_world_base)
     if policy != "free":
         run = run_folder(map_, "--unknown")
-        spheres = RobotSpheres(arm, T_world_base=sampler.scene.T_world_base)
         space = unknown_in_reach(run, reopen_log(run), spheres)
-        solids = field_of(space, policy, spheres, arm.home, margin=max(sampler.margin, sampler.arm_margin))
-    sampler.agree_with_plans(GaussianCollisionField(GaussianModel.load(map_file(map_))), solids)
+        solids = field_of(space, policy, spheres, arm.home, margin=most)
+    model, known = GaussianModel.load(map_file(map_)), find_workspace(map_)
+    plane = None if known is None else known.support_plane
+    around = PlanObstacles(GaussianCollisionField(model), model, spheres, arm.home, plane=plane)
+    sampler.agree_with_plans(around.field(most), solids)
 
 
 def _print(result: GraspResult, folder: Path, margin: str, *, verbose: bool) -> None:

@@ -19,9 +19,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from splatbot.collision import GaussianCollisionField, RobotSpheres
-    from splatbot.collision.unknown import UnknownPolicy
-    from splatbot.gaussians import GaussianModel
+    from splatbot.collision import GaussianCollisionField, RobotSpheres, UnknownSpace
     from splatbot.planning import GaussianRRTStar, JointTrajectory, PlanResult
     from splatbot.planning.closest import ClosestApproach
     from splatbot.results.region_plan import RegionPlan
@@ -41,6 +39,7 @@ def plan(
     margin: Annotated[str | None, tyro.conf.arg(metavar="M|auto")] = None,
     confidence: float = 0.999,
     unknown: Literal["free", "cautious", "occupied"] = "free",
+    support: bool = True,
     n_sigma: float = 2.0,
     speed: float = 0.2,
     budget_ms: float = 100.0,
@@ -74,6 +73,8 @@ def plan(
         confidence: share of the confirmed surface that the margin "auto" covers, 0..1.
         unknown: space that no frame of the run saw to be empty is free, or "occupied". With "cautious" it is occupied
             only where two frames looked and measured no depth, as at dark, shiny or transparent objects.
+        support: the support plane of the scene.yaml is an obstacle within the reach of the arm, also where no frame
+            saw it, unless the base is below it.
         n_sigma: surface of a Gaussian, in standard deviations.
         speed: fraction of the limits of velocity and acceleration, as MoveIt's scaling factors; 1 is as fast as the
             robot can.
@@ -100,7 +101,7 @@ def plan(
     from splatbot.planning import GaussianRRTStar, PoseGoal
     from splatbot.planning.closest import closest_approach
     from splatbot.report.plan_page import plan_html, plan_png
-    from splatbot.results.unknown import refuse_unknown
+    from splatbot.results.plan_obstacles import PlanObstacles
     from splatbot.robots.appearance import appearance, coarse_appearance
     from splatbot.robots.store import load_robot
 
@@ -118,13 +119,23 @@ def plan(
     with steps() as tell:
         tell("loading the map")
         of_map = GaussianCollisionField(model, n_sigma)
+        space = None
         if unknown != "free":
             tell("searching for unknown space")
-        field_at = _field_with_unknown(map, of_map, model, unknown, RobotSpheres(arm, T_world_base=T_world_base), here)
+            space = _unknown_space(map, RobotSpheres(arm, T_world_base=T_world_base))
+        around = PlanObstacles(
+            of_map,
+            model,
+            RobotSpheres(arm, T_world_base=T_world_base),
+            here,
+            plane=_support_plane(map) if support else None,
+            space=space,
+            policy=unknown,
+        )
         found = _plan(
             map,
             of_map,
-            lambda keep: GaussianRRTStar(field_at(keep), arm, T_world_base=T_world_base, margin=keep),
+            lambda keep: GaussianRRTStar(around.field(keep), arm, T_world_base=T_world_base, margin=keep),
             lambda planner: planner.plan(here, wanted, budget_ms=budget_ms, seed=seed),
             here if goal_pose is not None else np.stack([here, wanted]),
             margin="auto" if margin is None and map.is_dir() else margin or "0",
@@ -133,10 +144,11 @@ def plan(
             tell=tell,
         )
     result, trajectory = found.result, found.trajectory
-    refuse_unknown(result, len(model), unknown)
+    around.check(result)
     result.unwrap()
     assert trajectory is not None
-    covers = found.scope(n_sigma=n_sigma, unknown=unknown, confidence=confidence)
+    scope = found.scope(n_sigma=n_sigma, unknown=unknown, confidence=confidence)
+    covers = scope | {"map_gaussians": len(model), "support_plane": around.covers_support}
     nearest = closest_approach(found.planner.arm, found.planner.field, trajectory)
     folder = out if out is not None else Path("runs") / "plan"
     title = f"{arm.name} in {map.resolve().name}"
@@ -156,28 +168,31 @@ def plan(
     of_arm = (appearance(arm), arm.fk, arm.T_link_tcp)
     picture = plan_png(model, found.planner.arm, trajectory, *of_arm, nearest=nearest)
     replace_files(folder, writers | {"plan.png": write_bytes(picture)})
-    _print(result, trajectory, covers, nearest, len(model), folder)
+    what = None if nearest is None else around.kind(nearest.gaussian)
+    _print(result, trajectory, covers, None if nearest is None or what is None else (nearest, what), folder)
     next_ = f"splatbot twin --map {map} --robot {robot}{base_words(base)} --trajectory {folder / 'trajectory.json'}"
     print_text(f"next: {next_}")
     return 0
 
 
-def _field_with_unknown(
-    map_: Path,
-    of_map: GaussianCollisionField,
-    model: GaussianModel,
-    policy: UnknownPolicy,
-    arm: RobotSpheres,
-    here: NDArray[np.float64],
-) -> Callable[[float], GaussianCollisionField]:
-    """Return a function of the margin [m] that gives the field of a map with its unknown space under a policy."""
-    from splatbot.results.unknown import unknown_in_reach, with_unknown
+def _unknown_space(map_: Path, arm: RobotSpheres) -> UnknownSpace:
+    """Find the unknown space within reach of an arm.
+
+    Raises:
+        InputError: the map is in no run's folder.
+    """
+    from splatbot.results.unknown import unknown_in_reach
     from splatbot.robots.in_view import reopen_log
 
-    if policy == "free":
-        return lambda margin: of_map
     run = run_folder(map_, "--unknown")
-    return with_unknown(of_map, model, unknown_in_reach(run, reopen_log(run), arm), policy, arm, here)
+    return unknown_in_reach(run, reopen_log(run), arm)
+
+
+def _support_plane(map_: Path) -> NDArray[np.float64] | None:
+    from splatbot.workspace import find_workspace
+
+    known = find_workspace(map_)
+    return None if known is None else known.support_plane
 
 
 def _plan(
@@ -280,6 +295,10 @@ def _summary(
 
 _BASE_IN_MAP = "NOT COVERED, AND PROBABLY WRONG: more of the mounted link than its foot is in the map; check --base"
 _CLOSE = "less than 2 mm beyond the margin; a larger --margin keeps the arm farther away"
+_SUPPORT = {
+    True: "covered within reach, also where no frame saw it",
+    False: "NOT COVERED beyond the map: no scene.yaml has it, the base is below it, or --no-support",
+}
 _UNKNOWN = {
     "free": "not covered: counts as free",
     "cautious": "covered where two frames looked and measured no depth",
@@ -291,8 +310,7 @@ def _print(
     result: PlanResult,
     trajectory: JointTrajectory,
     covers: dict[str, Any],
-    nearest: ClosestApproach | None,
-    mapped: int,
+    nearest: tuple[ClosestApproach, str] | None,
     folder: Path,
 ) -> None:
     from splatbot.cli.tables import print_table
@@ -306,8 +324,8 @@ def _print(
         ("duration", f"{trajectory.duration:.3f} s"),
         ("certified", "yes" if c.certified else "NO"),
         ("clearance", clearance_text(c)),
-        *([] if nearest is None else [("nearest", nearest.describe(mapped))]),
-        *([("close", _CLOSE)] if nearest is not None and nearest.close else []),
+        *([] if nearest is None else [("nearest", nearest[0].describe(nearest[1]))]),
+        *([("close", _CLOSE)] if nearest is not None and nearest[0].close else []),
         ("covers", f"moving links against the map at {covers['n_sigma']:g} sigma and against the arm itself"),
         ("base", _BASE_IN_MAP if covers["base_in_map"] else "not covered: the mounted link is not checked"),
         (
@@ -316,6 +334,7 @@ def _print(
             if covers["hand"]
             else "not covered: this robot has none; see `splatbot robot list`",
         ),
+        ("support plane", _SUPPORT[covers["support_plane"]]),
         ("unknown space", _UNKNOWN[covers["unknown_space"]]),
         ("margin", _margin_text(covers)),
         ("written to", str(folder)),

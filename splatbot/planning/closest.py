@@ -58,9 +58,8 @@ class ClosestApproach:
         """Return whether the clearance is small compared with errors that the margin does not cover."""
         return self.clearance < CONSTANTS.close
 
-    def describe(self, mapped: int) -> str:
-        """Describe the moment, for a field of which the first ``mapped`` Gaussians are the map."""
-        what = "the map" if self.gaussian < mapped else "unknown space"
+    def describe(self, what: str = "the map") -> str:
+        """Describe the moment, with the kind of obstacle that is near."""
         place = ", ".join(f"{x:.2f}" for x in self.at_base)
         named = f" (after {self.name})" if self.name else ""
         away = f"{1e3 * self.clearance:.1f} mm beyond the margin from {what}"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,10 +9,8 @@ from numpy.typing import ArrayLike
 
 from splatbot.collision import GaussianCollisionField, RobotSpheres, UnknownSpace, find_unknown
 from splatbot.collision.unknown import UnknownPolicy
-from splatbot.errors import SplatbotError
 from splatbot.gaussians import GaussianModel
 from splatbot.logs import Log
-from splatbot.planning import PlanResult, PlanStatus
 from splatbot.results.folder import RunFolder
 from splatbot.results.views import raw_views
 
@@ -78,66 +75,3 @@ def field_of(
     """Return the field of :func:`obstacles` alone, or None without obstacles."""
     solids = obstacles(space, policy, arm, start, margin=margin)
     return GaussianCollisionField(solids) if len(solids) else None
-
-
-def with_unknown(
-    field: GaussianCollisionField,
-    model: GaussianModel,
-    space: UnknownSpace,
-    policy: UnknownPolicy,
-    arm: RobotSpheres,
-    start: ArrayLike,
-) -> Callable[[float], GaussianCollisionField]:
-    """Return a function of the margin [m] that gives the field of a map with its unknown space as obstacles.
-
-    Args:
-        field: collision field of the map.
-        model: the map.
-        space: its unknown space.
-        policy: treatment of unknown space.
-        arm: the arm.
-        start: (J,) configuration at which it is [rad or m].
-    """
-
-    def around(margin: float) -> GaussianCollisionField:
-        solids = obstacles(space, policy, arm, start, margin=margin)
-        if not len(solids):
-            return field
-        return GaussianCollisionField(GaussianModel.concatenate([model, solids]), field.n_sigma)
-
-    return around
-
-
-_MEANINGS = {
-    "cautious": "space in which two frames looked and measured no depth",
-    "occupied": "space that no frame saw to be empty",
-}
-
-
-def refuse_unknown(result: PlanResult, gaussians: int, policy: UnknownPolicy) -> None:
-    """Check that unknown space makes neither start nor goal of a plan invalid.
-
-    Args:
-        result: of a plan on the map and the solids of unknown space, in this order.
-        gaussians: number of Gaussians of the map.
-        policy: treatment of unknown space.
-
-    Raises:
-        SplatbotError: it does; the message names the link and the kind of space.
-    """
-    ends = {PlanStatus.START_STATE_IN_COLLISION: "start", PlanStatus.GOAL_IN_COLLISION: "goal"}
-    cause = result.cause
-    if result.status not in ends or cause is None or cause.gaussian < gaussians:
-        return
-    named = f" (after {cause.name})" if cause.name else ""
-    raise UnknownSpaceError(
-        f"link {cause.link}{named} is {1e3 * cause.depth:.1f} mm deep in {_MEANINGS[policy]}.",
-        field=ends[result.status],
-        hint="map the place from more views, give another goal, or let unknown space be free",
-    )
-
-
-class UnknownSpaceError(SplatbotError):
-    """The start or the goal of a plan is in unknown space."""
-
-    http_status = 422

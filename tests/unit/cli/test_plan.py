@@ -14,7 +14,6 @@ import pytest
 
 from splatbot.bench.tabletop import tabletop
 from splatbot.collision import GaussianCollisionField, RobotSpheres
-from splatbot.errors import SplatbotError
 from splatbot.robots.panda import panda
 from splatbot.workspace import Workspace
 from tests.unit.cli.conftest import RunCommand, assert_refused
@@ -125,25 +124,6 @@ def test_a_base_that_stands_in_the_map_is_reported(run: RunCommand, map_file: Pa
     answer = run("plan", "--map", map_file, *sunk, "--out", tmp_path / "out")
     assert answer.code == 0, answer.err
     assert "more of the mounted link than its foot is in the map; check --base" in answer.out
-
-
-def test_unknown_space_at_the_start_is_named_instead_of_a_gaussian() -> None:
-    from splatbot.gaussians import GaussianModel
-    from splatbot.planning import GaussianRRTStar
-    from splatbot.results.unknown import refuse_unknown
-
-    model = tabletop().gaussians(2000)
-    at = RobotSpheres(panda()).centers(panda().home[None])[0, 100:102]
-    unknown = GaussianModel.from_activated(
-        means=at, quats=np.eye(4)[[0, 0]], scales=np.full((2, 3), 0.01), opacities=np.ones(2), colors=np.ones((2, 3))
-    )
-    field = GaussianCollisionField(GaussianModel.concatenate([model, unknown]))
-    result = GaussianRRTStar(field, panda()).plan(panda().home, panda().home, budget_ms=10)
-    with pytest.raises(SplatbotError, match="no frame saw to be empty"):
-        refuse_unknown(result, len(model), "occupied")
-    with pytest.raises(SplatbotError, match="two frames looked and measured no depth"):
-        refuse_unknown(result, len(model), "cautious")
-    refuse_unknown(result, len(model) + 2, "occupied")  # a Gaussian of the map is named by the planner
 
 
 def test_the_base_is_taken_from_the_scene_file_of_the_map_and_a_pose_is_reached(

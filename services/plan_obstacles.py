@@ -1,8 +1,6 @@
-"""Unknown space of served maps as obstacles of a plan."""
+"""Obstacles of plans in served maps in addition to the map: support plane and unknown space."""
 
 from __future__ import annotations
-
-from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,36 +8,39 @@ from numpy.typing import NDArray
 from splatbot.collision import GaussianCollisionField, RobotSpheres, UnknownSpace
 from splatbot.collision.unknown import UnknownPolicy
 from splatbot.errors import InputError
-from splatbot.results.unknown import field_of, unknown_in_reach, with_unknown
+from splatbot.results.plan_obstacles import PlanObstacles
+from splatbot.results.unknown import field_of, unknown_in_reach
 from splatbot.robots.in_view import reopen_log
 from splatbot.robots.robot import RobotModel
 from splatbot.services.schemas import Pose
 from splatbot.services.store import ServedMap
 
 
-def field_with_unknown(
+def plan_obstacles(
     served: ServedMap,
-    policy: UnknownPolicy,
     robot: RobotModel,
     T_world_base: NDArray[np.float64],
     start: NDArray[np.float64],
-) -> Callable[[float], GaussianCollisionField]:
-    """Return a function of the margin [m] that gives the field of a map with its unknown space under a policy.
+    *,
+    policy: UnknownPolicy = "free",
+    support: bool = True,
+) -> PlanObstacles:
+    """Return the obstacles of a plan: the map, its support plane, and its unknown space under a policy.
 
     The search for unknown space takes seconds, once for each map version and robot. :func:`check_unknown` comes first.
 
     Args:
         served: the map.
-        policy: treatment of unknown space.
         robot: the arm.
-        T_world_base: (4, 4) pose of the map's base. Bases of requests would make each request a search.
+        T_world_base: (4, 4) pose of its base. With unknown space it is the map's, as others would each be a search.
         start: (J,) configuration at which the arm is [rad or m]; the space that it fills is no obstacle.
+        policy: treatment of unknown space.
+        support: whether the support plane of the map's scene.yaml is an obstacle.
     """
-    field = served.field
-    if policy == "free":
-        return lambda margin: field
     arm = RobotSpheres(robot, T_world_base=T_world_base)
-    return with_unknown(field, served.ready.model, _space(served, arm), policy, arm, start)
+    known = served.workspace.support_plane if served.workspace is not None and support else None
+    space = None if policy == "free" else _space(served, arm)
+    return PlanObstacles(served.field, served.ready.model, arm, start, plane=known, space=space, policy=policy)
 
 
 def unknown_field(
@@ -52,7 +53,7 @@ def unknown_field(
 ) -> GaussianCollisionField | None:
     """Return the field of unknown space alone, for an arm that is at home; None if it is free.
 
-    For the arguments see :func:`field_with_unknown`.
+    For the arguments see :func:`plan_obstacles`.
     """
     if policy == "free":
         return None

@@ -1,0 +1,205 @@
+"""Obstacles of a plan in addition to the map: the support plane beyond its measured part, and unknown space."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+
+from splatbot.collision import GaussianCollisionField, RobotSpheres, UnknownSpace
+from splatbot.collision.unknown import UnknownPolicy
+from splatbot.errors import SplatbotError
+from splatbot.gaussians import GaussianModel
+from splatbot.geometry import rotation_to_quat
+from splatbot.planning import PlanResult, PlanStatus
+from splatbot.protocols import Array
+from splatbot.results.unknown import obstacles
+
+Kind = Literal["the map", "the support plane", "unknown space"]
+
+
+@dataclass(frozen=True)
+class SupportConstants:
+    """Constants of a support plane that plans avoid.
+
+    Args:
+        spacing: [m] distance between the centres of its tiles.
+        radius: [m] semi-axis of a tile, an ellipsoid. It exceeds the distance from a centre to the farthest point
+            between four, so that the tiles overlap.
+        thickness: [m] semi-axis across the plane. The upper side of a tile is at the plane.
+        above: [m] least height of the base over the plane. An arm that is mounted lower is beside the support, and the
+            plane is not extended to it.
+    """
+
+    spacing: float = 0.04
+    radius: float = 0.06
+    thickness: float = 0.005
+    above: float = -0.02
+
+
+CONSTANTS = SupportConstants()
+
+
+def support_tiles(
+    plane: ArrayLike, arm: RobotSpheres, occupied: ArrayLike, *, margin: float = 0.0, n_sigma: float = 2.0
+) -> GaussianModel:
+    """Return a support plane within reach of an arm as flat Gaussians, without those that the arm touches at the start.
+
+    Args:
+        plane: (4,) = (n, d), the plane n · p + d = 0 with the upward unit normal n [m, world].
+        arm: the arm.
+        occupied: (J,) configuration at which the arm is [rad or m].
+        margin: clearance that a plan keeps [m]. Tiles within it of the arm are left out too, because a plan could not
+            start there.
+        n_sigma: surface of the tiles, in standard deviations.
+
+    Returns:
+        The tiles; none if the base is below the plane, or the plane is out of reach.
+    """
+    n, d = np.asarray(plane, dtype=np.float64)[:3], float(np.asarray(plane)[3])
+    base = arm.T_world_base[:3, 3]
+    height = float(n @ base + d)
+    centers, radii = arm.centers(np.asarray(occupied, dtype=np.float64)[None])[0], arm.spheres.radii + margin
+    reach = float(arm.robot.chain.reach(_last_to_far(arm)))
+    if height < CONSTANTS.above or height > reach:
+        return GaussianModel.empty(0)
+    R = _frame(n)
+    steps = np.arange(-np.ceil(reach / CONSTANTS.spacing), np.ceil(reach / CONSTANTS.spacing) + 1) * CONSTANTS.spacing
+    x, y = (grid.ravel() for grid in np.meshgrid(steps, steps))
+    inside = np.hypot(x, y) <= reach
+    foot = base - height * n
+    means = foot + np.outer(x[inside], R[:, 0]) + np.outer(y[inside], R[:, 1]) - CONSTANTS.thickness * n
+    # A sphere meets a tile at most where it meets the disc of the tile.
+    off = means[:, None] - centers[None]
+    along = np.abs(off @ n)
+    across = np.linalg.norm(off - (off @ n)[..., None] * n, axis=2)
+    met = (along < radii + CONSTANTS.thickness) & (across < radii + CONSTANTS.radius)
+    means = means[~met.any(axis=1)]
+    scales = np.array([CONSTANTS.radius, CONSTANTS.radius, CONSTANTS.thickness]) / n_sigma
+    count = len(means)
+    return GaussianModel.from_activated(
+        means=means,
+        quats=np.tile(rotation_to_quat(R), (count, 1)),
+        scales=np.tile(scales, (count, 1)),
+        opacities=np.full(count, 0.99),
+        colors=np.full((count, 3), 0.5),
+    )
+
+
+class PlanObstacles:
+    """The collision fields of a plan: the map, its support plane, and its unknown space under a policy.
+
+    Args:
+        field: collision field of the map.
+        model: the map.
+        arm: the arm.
+        start: (J,) configuration at which it is [rad or m].
+        plane: (4,) support plane of the map, see :func:`support_tiles`. If None, no plane is known or wanted.
+        space: unknown space of the map. If None, it counts as free.
+        policy: treatment of unknown space.
+    """
+
+    def __init__(
+        self,
+        field: GaussianCollisionField,
+        model: GaussianModel,
+        arm: RobotSpheres,
+        start: ArrayLike,
+        *,
+        plane: ArrayLike | None = None,
+        space: UnknownSpace | None = None,
+        policy: UnknownPolicy = "free",
+    ) -> None:
+        self._field, self._model, self._arm = field, model, arm
+        self._start, self._plane, self._space, self._policy = np.asarray(start), plane, space, policy
+        self._tiles = 0
+
+    @property
+    def covers_support(self) -> bool:
+        """Return whether the latest field has the support plane."""
+        return self._tiles > 0
+
+    def field(self, margin: float) -> GaussianCollisionField:
+        """Return the field for plans with a margin [m]; what the arm touches at the start is left out of the solids."""
+        parts = [self._model]
+        self._tiles = 0
+        if self._plane is not None:
+            n_sigma = self._field.n_sigma
+            parts.append(support_tiles(self._plane, self._arm, self._start, margin=margin, n_sigma=n_sigma))
+            self._tiles = len(parts[-1])
+        if self._space is not None:
+            parts.append(obstacles(self._space, self._policy, self._arm, self._start, margin=margin))
+        if sum(len(part) for part in parts[1:]) == 0:
+            return self._field
+        solids = [_of_degree(part, self._model.sh_degree) for part in parts[1:] if len(part)]
+        return GaussianCollisionField(GaussianModel.concatenate([self._model, *solids]), self._field.n_sigma)
+
+    def kind(self, gaussian: int) -> Kind:
+        """Return the kind of obstacle of a row in the latest field."""
+        if gaussian < len(self._model):
+            return "the map"
+        return "the support plane" if gaussian < len(self._model) + self._tiles else "unknown space"
+
+    def check(self, result: PlanResult) -> None:
+        """Check that neither support plane nor unknown space makes start or goal of a plan invalid.
+
+        Raises:
+            UnmappedObstacleError: one does; the message names the link, the obstacle and the place.
+        """
+        ends = {PlanStatus.START_STATE_IN_COLLISION: "start", PlanStatus.GOAL_IN_COLLISION: "goal"}
+        cause = result.cause
+        if result.status not in ends or cause is None or cause.gaussian < 0:
+            return
+        kind = self.kind(cause.gaussian)
+        if kind == "the map":
+            return
+        named = f" (after {cause.name})" if cause.name else ""
+        what = _MEANINGS[self._policy] if kind == "unknown space" else "the support plane of the scene.yaml"
+        place = "" if cause.at_base is None else f" at ({', '.join(f'{x:.2f}' for x in cause.at_base)}) m from the base"
+        hints = {
+            "unknown space": "map the place from more views, give another goal, or let unknown space be free",
+            "the support plane": "give another goal, correct the plane in scene.yaml, or leave it out",
+        }
+        raise UnmappedObstacleError(
+            f"link {cause.link}{named} is {1e3 * max(cause.depth, 0.0):.1f} mm deep in {what}{place}.",
+            field=ends[result.status],
+            hint=hints[kind],
+        )
+
+
+_MEANINGS = {
+    "cautious": "space in which two frames looked and measured no depth",
+    "occupied": "space that no frame saw to be empty",
+    "free": "unknown space",
+}
+
+
+class UnmappedObstacleError(SplatbotError):
+    """The start or the goal of a plan is in the support plane or in unknown space."""
+
+    http_status = 422
+
+
+def _last_to_far(arm: RobotSpheres) -> Array:
+    """Return a pose (4, 4) on the last link whose distance is that of its farthest point."""
+    last = arm.spheres.link == arm.spheres.link.max()
+    T = np.eye(4)
+    T[2, 3] = float((np.linalg.norm(arm.spheres.centers[last], axis=1) + arm.spheres.radii[last]).max())
+    return T
+
+
+def _frame(n: Array) -> Array:
+    """Return a rotation (3, 3) whose z axis is the unit vector n (3,)."""
+    x = np.cross(np.eye(3)[int(np.argmin(np.abs(n)))], n)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(n, x), n], axis=1)
+
+
+def _of_degree(model: GaussianModel, degree: int) -> GaussianModel:
+    """Return a model with harmonics of another degree, all 0 beyond the first."""
+    sh = torch.zeros(len(model), (degree + 1) ** 2, 3)
+    sh[:, 0] = model.sh[:, 0]
+    return replace(model, sh=sh)
