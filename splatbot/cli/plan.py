@@ -42,7 +42,7 @@ def plan(
     support: bool = True,
     n_sigma: float = 2.0,
     speed: float = 0.2,
-    budget_ms: float = 100.0,
+    budget_ms: float = 500.0,
     seed: int = 0,
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
 ) -> int:
@@ -294,6 +294,8 @@ def _summary(
 
 
 _BASE_IN_MAP = "NOT COVERED, AND PROBABLY WRONG: more of the mounted link than its foot is in the map; check --base"
+_LONG_DETOUR = 2.0
+_DETOUR = "{:.1f} times the direct distance in joint space; a longer --budget-ms may shorten it"
 _CLOSE = "less than 2 mm beyond the margin; a larger --margin keeps the arm farther away"
 _SUPPORT = {
     True: "covered within reach, also where no frame saw it",
@@ -321,6 +323,7 @@ def _print(
     rows = [
         ("first path after", f"{1e3 * result.first_seconds:.2f} ms"),
         ("length", f"{result.path.cost:.3f} rad, {len(result.path)} waypoints"),
+        *([("detour", _DETOUR.format(detour))] if (detour := _detour(result.path)) > _LONG_DETOUR else []),
         ("duration", f"{trajectory.duration:.3f} s"),
         ("certified", "yes" if c.certified else "NO"),
         ("clearance", clearance_text(c)),
@@ -340,6 +343,12 @@ def _print(
         ("written to", str(folder)),
     ]
     print_table(rows, title="planned")
+
+
+def _detour(path: Any) -> float:
+    """Return the length of a path in terms of the distance between its ends."""
+    direct = float(((path.waypoints[-1] - path.waypoints[0]) ** 2).sum() ** 0.5)
+    return float(path.cost) / direct if direct > 0.0 else 1.0
 
 
 def _margin_text(covers: dict[str, Any]) -> str:

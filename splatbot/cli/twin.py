@@ -220,6 +220,8 @@ def _print(result: TwinResult, entries: list[LedgerEntry], written: list[Path]) 
     near = result.clearance
     where = f" ({near.part} and {near.other} at {near.time:.2f} s)" if near.part else " or more"
     console.print(f"minimum clearance of the arm: {1e3 * near.value:.1f} mm{where}")
+    if not result.contacts and near.part:
+        console.print("no contact of the arm")
     for contact in result.contacts:
         console.print(
             f"contact: {contact.part} and {contact.other}, {contact.first:.3f} to {contact.last:.3f} s, "

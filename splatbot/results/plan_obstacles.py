@@ -161,7 +161,7 @@ class PlanObstacles:
         place = "" if cause.at_base is None else f" at ({', '.join(f'{x:.2f}' for x in cause.at_base)}) m from the base"
         hints = {
             "unknown space": "map the place from more views, give another goal, or let unknown space be free",
-            "the support plane": "give another goal, correct the plane in scene.yaml, or leave it out",
+            "the support plane": "give another goal, correct the plane in scene.yaml, or leave it out (`--no-support`)",
         }
         raise UnmappedObstacleError(
             f"link {cause.link}{named} is {1e3 * max(cause.depth, 0.0):.1f} mm deep in {what}{place}.",
