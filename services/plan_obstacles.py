@@ -53,7 +53,7 @@ def unknown_field(
 ) -> GaussianCollisionField | None:
     """Return the field of unknown space alone, for an arm that is at home; None if it is free.
 
-    For the arguments see :func:`plan_obstacles`.
+    The arguments are those of :func:`plan_obstacles`.
     """
     if policy == "free":
         return None

@@ -73,8 +73,8 @@ def plan(
         confidence: share of the confirmed surface that the margin "auto" covers, 0..1.
         unknown: space that no frame of the run saw to be empty is free, or "occupied". With "cautious" it is occupied
             only where two frames looked and measured no depth, as at dark, shiny or transparent objects.
-        support: the support plane of the scene.yaml is an obstacle within the reach of the arm, also where no frame
-            saw it, unless the base is below it.
+        support: the support plane of the scene.yaml is an obstacle within reach, also where no frame saw it. A base
+            below the plane excludes it.
         n_sigma: surface of a Gaussian, in standard deviations.
         speed: fraction of the limits of velocity and acceleration, as MoveIt's scaling factors; 1 is as fast as the
             robot can.

@@ -22,7 +22,7 @@ Kind = Literal["the map", "the support plane", "unknown space"]
 
 
 @dataclass(frozen=True)
-class SupportConstants:
+class SupportTileConstants:
     """Constants of a support plane that plans avoid.
 
     Args:
@@ -30,8 +30,8 @@ class SupportConstants:
         radius: [m] semi-axis of a tile, an ellipsoid. It exceeds the distance from a centre to the farthest point
             between four, so that the tiles overlap.
         thickness: [m] semi-axis across the plane. The upper side of a tile is at the plane.
-        above: [m] least height of the base over the plane. An arm that is mounted lower is beside the support, and the
-            plane is not extended to it.
+        above: [m] least height of the base over the plane. An arm that is mounted lower stands next to the
+            support, and the plane is not extended to it.
     """
 
     spacing: float = 0.04
@@ -40,7 +40,7 @@ class SupportConstants:
     above: float = -0.02
 
 
-CONSTANTS = SupportConstants()
+CONSTANTS = SupportTileConstants()
 
 
 def support_tiles(
@@ -123,7 +123,7 @@ class PlanObstacles:
         return self._tiles > 0
 
     def field(self, margin: float) -> GaussianCollisionField:
-        """Return the field for plans with a margin [m]; what the arm touches at the start is left out of the solids."""
+        """Return the field for plans with a margin [m]; solids that the arm touches at the start are left out."""
         parts = [self._model]
         self._tiles = 0
         if self._plane is not None:
