@@ -62,7 +62,8 @@ def plan(
         start: joint values [rad or m], or "home".
         goal: joint values, or "home".
         goal_pose: pose of the tool instead of --goal, in the frame of the robot's base: position [m] and quaternion.
-        grasp: file of `splatbot grasp`; the goal is the pre-grasp, from which the approach of the file is certified.
+        grasp: file of `splatbot grasp`; the goal is the pre-grasp. The approach from there is in that file, and is not
+            part of this plan.
         grasp_index: rank of the grasp in that file, from 0.
         robot: its name, as of `splatbot robot list`.
         base: pose of the robot's base in the map; by default that of the scene.yaml next to the map (see
@@ -170,6 +171,10 @@ def plan(
     replace_files(folder, writers | {"plan.png": write_bytes(picture)})
     what = None if nearest is None else around.kind(nearest.gaussian)
     _print(result, trajectory, covers, None if nearest is None or what is None else (nearest, what), folder)
+    if grasp is not None:
+        print_text(
+            f"the approach to the grasp is not part of this plan: approach_path of {grasp}, certified when found"
+        )
     next_ = f"splatbot twin --map {map} --robot {robot}{base_words(base)} --trajectory {folder / 'trajectory.json'}"
     print_text(f"next: {next_}")
     return 0

@@ -16,6 +16,7 @@ from splatbot.gaussians import GaussianModel
 from splatbot.geometry import rotation_to_quat
 from splatbot.planning import PlanResult, PlanStatus
 from splatbot.protocols import Array
+from splatbot.results.unknown import CONSTANTS as UNKNOWN
 from splatbot.results.unknown import obstacles
 
 Kind = Literal["the map", "the support plane", "unknown space"]
@@ -62,7 +63,10 @@ def support_tiles(
     n, d = np.asarray(plane, dtype=np.float64)[:3], float(np.asarray(plane)[3])
     base = arm.T_world_base[:3, 3]
     height = float(n @ base + d)
-    centers, radii = arm.centers(np.asarray(occupied, dtype=np.float64)[None])[0], arm.spheres.radii + margin
+    centers, radii = (
+        arm.centers(np.asarray(occupied, dtype=np.float64)[None])[0],
+        arm.spheres.radii + margin + UNKNOWN.slack,
+    )
     reach = float(arm.robot.chain.reach(_last_to_far(arm)))
     if height < CONSTANTS.above or height > reach:
         return GaussianModel.empty(0)

@@ -23,11 +23,13 @@ class RunUnknownConstants:
         voxel: [m] smallest edge length of a voxel.
         max_voxels: largest number of voxels; a larger box has larger voxels.
         samples: number of random configurations that determine the reach.
+        slack: [m] additional room around the arm at the start, because a certificate needs a clearance above 0.
     """
 
     voxel: float = 0.01
     max_voxels: int = 10_000_000
     samples: int = 500
+    slack: float = 0.001
 
 
 CONSTANTS = RunUnknownConstants()
@@ -65,7 +67,7 @@ def obstacles(
             start there.
     """
     q = np.atleast_2d(np.asarray(occupied, dtype=np.float64))
-    centers, radii = arm.centers(q).reshape(-1, 3), np.tile(arm.spheres.radii + margin, len(q))
+    centers, radii = arm.centers(q).reshape(-1, 3), np.tile(arm.spheres.radii + margin + CONSTANTS.slack, len(q))
     return space.without(np.c_[centers, radii]).solids(policy=policy)
 
 
