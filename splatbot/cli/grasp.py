@@ -173,7 +173,9 @@ def grasp(
     result.unwrap()
     _print(result, folder, margin_text, verbose=verbose)
     if not hand_only:
-        on = f"--map {map} --robot {robot}{base_words(base)}{'' if unknown == 'free' else f' --unknown {unknown}'}"
+        on = f"--map {map} --robot {robot}{base_words(base)}"
+        on += "" if unknown == "free" else f" --unknown {unknown}"
+        on += "" if min_observations == 1 else f" --min-observations {min_observations}"
         print_text(f"next: splatbot plan {on} --start home --grasp {folder / 'grasp.json'}")
     return 0
 
@@ -308,7 +310,8 @@ def _agree_with_plans(sampler: GraspSampler, map_: Path, arm: RobotModel, policy
         solids = field_of(space, policy, spheres, arm.home, margin=most)
     model, known = GaussianModel.load(map_file(map_)), find_workspace(map_)
     plane = None if known is None else known.support_plane
-    around = PlanObstacles(GaussianCollisionField(model), model, spheres, arm.home, plane=plane)
+    field = GaussianCollisionField(model, min_observations=sampler.min_observations)
+    around = PlanObstacles(field, model, spheres, arm.home, plane=plane)
     sampler.agree_with_plans(around.field(most), solids)
 
 

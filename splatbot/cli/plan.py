@@ -41,6 +41,7 @@ def plan(
     unknown: Literal["free", "cautious", "occupied"] = "free",
     support: bool = True,
     n_sigma: float = 2.0,
+    min_observations: int = 1,
     speed: float = 0.2,
     budget_ms: float = 500.0,
     seed: int = 0,
@@ -77,6 +78,7 @@ def plan(
         support: the support plane of the scene.yaml is an obstacle within reach, also where no frame saw it. A base
             below the plane excludes it.
         n_sigma: surface of a Gaussian, in standard deviations.
+        min_observations: Gaussians that the depth of fewer keyframes supports are ignored, as in `splatbot grasp`.
         speed: fraction of the limits of velocity and acceleration, as MoveIt's scaling factors; 1 is as fast as the
             robot can.
         budget_ms: time budget of the planner [ms].
@@ -119,7 +121,7 @@ def plan(
         wanted = _joints(goal or (), arm, "--goal")
     with steps() as tell:
         tell("loading the map")
-        of_map = GaussianCollisionField(model, n_sigma)
+        of_map = GaussianCollisionField(model, n_sigma, min_observations=min_observations)
         space = None
         if unknown != "free":
             tell("searching for unknown space")
@@ -149,7 +151,7 @@ def plan(
     result.unwrap()
     assert trajectory is not None
     scope = found.scope(n_sigma=n_sigma, unknown=unknown, confidence=confidence)
-    covers = scope | {"map_gaussians": len(model), "support_plane": around.covers_support}
+    covers = scope | {"map_gaussians": len(of_map), "support_plane": around.covers_support}
     nearest = closest_approach(found.planner.arm, found.planner.field, trajectory)
     folder = out if out is not None else Path("runs") / "plan"
     title = f"{arm.name} in {map.resolve().name}"

@@ -139,7 +139,11 @@ class PlanObstacles:
         if sum(len(part) for part in parts[1:]) == 0:
             return self._field
         solids = [_of_degree(part, self._model.sh_degree) for part in parts[1:] if len(part)]
-        return GaussianCollisionField(GaussianModel.concatenate([self._model, *solids]), self._field.n_sigma)
+        return GaussianCollisionField(
+            GaussianModel.concatenate([self._model, *solids]),
+            self._field.n_sigma,
+            min_observations=self._field.gate.min_observations,
+        )
 
     def kind(self, gaussian: int) -> Kind:
         """Return the kind of obstacle of a row in the latest field."""
@@ -174,6 +178,7 @@ class PlanObstacles:
         )
 
 
+_ALWAYS = 1 << 30  # observations of solids
 _MEANINGS = {
     "cautious": "space in which two frames looked and measured no depth",
     "occupied": "space that no frame saw to be empty",
@@ -203,7 +208,7 @@ def _frame(n: Array) -> Array:
 
 
 def _of_degree(model: GaussianModel, degree: int) -> GaussianModel:
-    """Return a model with harmonics of another degree, all 0 beyond the first."""
+    """Return solids with harmonics of another degree, all 0 beyond the first; no gate of observations removes them."""
     sh = torch.zeros(len(model), (degree + 1) ** 2, 3)
     sh[:, 0] = model.sh[:, 0]
-    return replace(model, sh=sh)
+    return replace(model, sh=sh, observations=torch.full((len(model),), _ALWAYS, dtype=torch.int32))
