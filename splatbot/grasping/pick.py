@@ -201,8 +201,9 @@ class _Pick:
         """Look at the target from the pre-grasp; return the plan to where it is now."""
         self.stage = PickStage.LOOK
         view = camera.look()
-        found = relocate(self.s.scene, self.s.surface(self.target), view)
-        if not found.shown:  # another grasp may look from another side
+        surface = self.s.surface(self.target)
+        found, gone = relocate(self.s.scene, surface, view), share_gone(surface.points, view)
+        if not found.shown and (gone is None or gone < LOOK.min_gone):  # another grasp may look from another side
             raise _MissedError(PickOutcome.TARGET_MOVED, found.reason)
         if found.reason:
             raise _EndedError(PickOutcome.TARGET_MOVED, found.reason)
