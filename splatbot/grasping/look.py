@@ -56,7 +56,7 @@ class LookConstants:
     voxel: float = 0.003
     close: float = 0.005
     min_points: int = 30
-    min_share: float = 0.6
+    min_share: float = 0.8
     tie: float = 0.93
     noise: tuple[float, float] = (0.002, float(np.radians(2.0)))
     support: float = 0.005
