@@ -23,14 +23,14 @@ from splatbot.errors import FormatError
 from splatbot.geometry import transform_points
 from splatbot.protocols import Array
 from splatbot.report.robot_drawing import Color, DrawnPart
-from splatbot.robots.hand_appearance import hand_parts
+from splatbot.robots.hand_appearance import DARK, hand_parts
 from splatbot.robots.maker_meshes import Source
 from splatbot.robots.panda import T_LINK_HAND, panda
 from splatbot.robots.robot import RobotModel
 from splatbot.robots.visual import MOST_TRIANGLES, STEP, simplify
 
 _FILE = Path(__file__).parent / "bodies" / "panda_appearance.npz"
-_LIGHT, _DARK = (0.90, 0.90, 0.91), (0.30, 0.31, 0.33)
+_LIGHT = (0.90, 0.90, 0.91)
 _GREY = (200, 200, 200)  # of a mesh without a material
 
 
@@ -43,8 +43,8 @@ def appearance(robot: RobotModel, opening: float | None = None) -> list[DrawnPar
     parts, fingers = links_and_finger(robot)
     hand = hand_parts(robot, opening)
     if hand is not None:
-        arm = [part for part in parts if part.link < len(robot)]
-        return [*arm, *_wrist(robot), *hand]
+        before = [part for part in parts if part.link < len(robot)]
+        return [*before, *(part for part in _link_meshes(robot) if part.link == len(robot)), *hand]
     return parts + [part for piece in fingers for part in _fingers(robot, piece.triangles, piece.color, opening)]
 
 
@@ -54,22 +54,21 @@ def links_and_finger(robot: RobotModel) -> tuple[list[DrawnPart], list[DrawnPart
     Raises:
         FormatError: the stored meshes are damaged.
     """
-    last, meshes = len(robot), _panda_meshes() if _has_panda_arm(robot) else {}
-    parts = [replace(piece, link=k) for k in range(last + 1) for piece in meshes.get(f"link{k}", ())]
+    last, parts = len(robot), _link_meshes(robot)
     if robot is panda():
+        meshes = _panda_meshes()
         parts += [
             replace(piece, link=last, triangles=transform_points(T_LINK_HAND, piece.triangles))
             for piece in meshes["hand"]
         ]
         return parts, meshes["finger"]
-    parts += [DrawnPart(mesh.link, mesh.triangles(), _LIGHT) for mesh in robot.visual]
     arm = {part.link for part in parts}
     parts += [
-        DrawnPart(shape.link, shape.triangles(), _DARK) for shape in robot.shapes if shape.link not in arm - {last}
+        DrawnPart(shape.link, shape.triangles(), DARK) for shape in robot.shapes if shape.link not in arm - {last}
     ]
     fingers: list[DrawnPart] = []
     if robot.gripper is not None and robot.gripper.shapes:
-        fingers = [DrawnPart(0, np.concatenate([shape.triangles() for shape in robot.gripper.shapes]), _DARK)]
+        fingers = [DrawnPart(0, np.concatenate([shape.triangles() for shape in robot.gripper.shapes]), DARK)]
     drawn, spheres = {part.link for part in parts} | ({last} if fingers else set()), robot.spheres()
     balls = [
         DrawnPart(int(link), np.asarray(center + radius * _ball()), _LIGHT)
@@ -79,11 +78,11 @@ def links_and_finger(robot: RobotModel) -> tuple[list[DrawnPart], list[DrawnPart
     return parts + balls, fingers
 
 
-def _wrist(robot: RobotModel) -> list[DrawnPart]:
-    """Return the meshes of the last link without its hand."""
-    if _has_panda_arm(robot):
-        return [replace(piece, link=len(robot)) for piece in _panda_meshes().get(f"link{len(robot)}", ())]
-    return [DrawnPart(mesh.link, mesh.triangles(), _LIGHT) for mesh in robot.visual if mesh.link == len(robot)]
+def _link_meshes(robot: RobotModel) -> list[DrawnPart]:
+    """Return the visual meshes of the links, without hands."""
+    meshes = _panda_meshes() if _has_panda_arm(robot) else {}
+    stored = [replace(piece, link=k) for k in range(len(robot) + 1) for piece in meshes.get(f"link{k}", ())]
+    return stored + [DrawnPart(mesh.link, mesh.triangles(), _LIGHT) for mesh in robot.visual]
 
 
 def coarse_appearance(robot: RobotModel, most: int = 250) -> list[DrawnPart]:

@@ -25,7 +25,7 @@ from splatbot.robots.visual import STEP, simplify
 
 _FILE = Path(__file__).parent / "bodies" / "2f85_appearance.npz"
 _MOST_TRIANGLES = 500  # of a link
-_DARK = (0.30, 0.31, 0.33)
+DARK = (0.30, 0.31, 0.33)
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +59,7 @@ def hand_parts(robot: RobotModel, opening: float | None) -> list[DrawnPart] | No
         return None
     T_link_flange = robot.T_link_tcp @ inverse(hand.T_flange_tcp)
     pieces = _stored().at(2 * hand.stroke if opening is None else opening)
-    return [DrawnPart(len(robot), transform_points(T_link_flange, each), _DARK) for each in pieces]
+    return [DrawnPart(len(robot), transform_points(T_link_flange, each), DARK) for each in pieces]
 
 
 @cache

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from splatbot.collision import GaussianCollisionField, RobotSpheres, UnknownSpace
+from splatbot.collision import RobotSpheres
 from splatbot.collision.unknown import UnknownPolicy
 from splatbot.errors import InputError
 from splatbot.results.plan_obstacles import PlanObstacles
-from splatbot.results.unknown import field_of, unknown_in_reach
+from splatbot.results.unknown import unknown_in_reach
 from splatbot.robots.in_view import reopen_log
 from splatbot.robots.robot import RobotModel
 from splatbot.services.schemas import Pose
@@ -39,26 +39,12 @@ def plan_obstacles(
     """
     arm = RobotSpheres(robot, T_world_base=T_world_base)
     known = served.workspace.support_plane if served.workspace is not None and support else None
-    space = None if policy == "free" else _space(served, arm)
+    space = None
+    if policy != "free":
+        run = served.run
+        assert run is not None  # by check_unknown
+        space = served.derived.get(("unknown space", robot.name), lambda: unknown_in_reach(run, reopen_log(run), arm))
     return PlanObstacles(served.field, served.ready.model, arm, start, plane=known, space=space, policy=policy)
-
-
-def unknown_field(
-    served: ServedMap,
-    policy: UnknownPolicy,
-    robot: RobotModel,
-    T_world_base: NDArray[np.float64],
-    *,
-    margin: float,
-) -> GaussianCollisionField | None:
-    """Return the field of unknown space alone, for an arm that is at home; None if it is free.
-
-    The arguments are those of :func:`plan_obstacles`.
-    """
-    if policy == "free":
-        return None
-    arm = RobotSpheres(robot, T_world_base=T_world_base)
-    return field_of(_space(served, arm), policy, arm, robot.home, margin=margin)
 
 
 def check_unknown(served: ServedMap, policy: UnknownPolicy, given: Pose | None) -> None:
@@ -83,9 +69,3 @@ def check_unknown(served: ServedMap, policy: UnknownPolicy, given: Pose | None) 
     if given is not None:
         hint = "write the base into the scene.yaml of the map, or leave unknown space free"
         raise InputError("is given, but unknown space is known for the base of the map.", field="base", hint=hint)
-
-
-def _space(served: ServedMap, arm: RobotSpheres) -> UnknownSpace:
-    run = served.run
-    assert run is not None  # by check_unknown
-    return served.derived.get(("unknown space", arm.robot.name), lambda: unknown_in_reach(run, reopen_log(run), arm))

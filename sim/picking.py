@@ -23,6 +23,9 @@ from splatbot.sim.twin import Twin
 from splatbot.sim.wrist_camera import TwinWristCamera
 from splatbot.workspace import NamedPlace
 
+MOST_MOVED = 0.1
+"""Largest push of a target [m]; it may not reach its neighbours."""
+
 
 @dataclass(frozen=True, eq=False)
 class TwinPick:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import mujoco
 import numpy as np
 
@@ -34,7 +32,6 @@ class TwinWristCamera:
         T_world_base: (4, 4) pose of the base in the map. If None, the map is in the twin's world.
         width: of the image [px]; the height is 3/4 of it.
         seed: of the sensor's noise.
-        before: called before each look, as the scene's own changes. If None, nothing is called.
 
     Raises:
         InputError: the twin has no arm.
@@ -47,14 +44,13 @@ class TwinWristCamera:
         T_world_base: Array | None = None,
         width: int = 320,
         seed: int = 0,
-        before: Callable[[], None] | None = None,
     ) -> None:
         robot = twin.world.robot
         if robot is None or twin.follower is None:
             raise InputError("has no robot.", field=twin.scene.name, hint="give the scene a robot")
         f = 0.7 * width
         self.camera = Camera(f, f, (width - 1) / 2, (3 * width // 4 - 1) / 2, width, 3 * width // 4)
-        self.twin, self.robot, self._qpos, self._before = twin, robot, twin.follower.qpos, before
+        self.twin, self.robot, self._qpos = twin, robot, twin.follower.qpos
         self._T_scene_base = base_of(twin.scene)
         self._T_world_base = self._T_scene_base if T_world_base is None else T_world_base
         self._T_link_camera = robot.T_link_tcp @ inverse(panda().T_link_tcp) @ T_PANDA_CAMERA
@@ -68,8 +64,6 @@ class TwinWristCamera:
         Raises:
             InputError: the sensor drops ten frames in a row.
         """
-        if self._before is not None:
-            self._before()
         world, data = self.twin.world, self.twin.data
         mujoco.mj_forward(world.model, data)
         T_base_camera = self.robot.fk(np.array(data.qpos[self._qpos]))[-1] @ self._T_link_camera

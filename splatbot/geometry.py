@@ -157,6 +157,14 @@ def rotation_to_quat(R: ArrayLike) -> Array:
     return np.where(q[..., :1] < 0, -q, q)
 
 
+def frame_along(z: ArrayLike) -> Array:
+    """Return a rotation (3, 3) whose third column is the unit vector z (3,)."""
+    axis = np.asarray(z, dtype=np.float64)
+    x = np.cross(np.eye(3)[int(np.argmin(np.abs(axis)))], axis)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(axis, x), axis], axis=1)
+
+
 def quat_multiply(a: ArrayLike, b: ArrayLike) -> Array:
     """Return the Hamilton products (..., 4) wxyz: the rotation ``b``, then ``a``."""
     p, q = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)

@@ -19,7 +19,7 @@ from splatbot.services.arms import known_robot
 from splatbot.services.codecs import answer, answers, body_of, request_body
 from splatbot.services.dependencies import ServedAfterFrames, Service, problems
 from splatbot.services.margins import MarginSource, margin_source
-from splatbot.services.plan_obstacles import check_unknown, plan_obstacles, unknown_field
+from splatbot.services.plan_obstacles import check_unknown, plan_obstacles
 from splatbot.services.robots_in_maps import base_in, objects_in
 from splatbot.services.schemas import GraspsRequest
 from splatbot.services.topics import GRASPS
@@ -73,8 +73,8 @@ def grasps(request: Request, served: ServedAfterFrames, service: Service, query:
         sampler.arm_margin = source.error.in_region(means[found.rows]).quantile(MARGIN.confidence)
     if not query.hand_only:
         most = max(sampler.margin, sampler.arm_margin)
-        around = plan_obstacles(served, robot, base, robot.home)
-        sampler.agree_with_plans(around.field(most), unknown_field(served, query.unknown, robot, base, margin=most))
+        around = plan_obstacles(served, robot, base, robot.home, policy=query.unknown)
+        sampler.agree_with_plans(around.field(most), around.unknown_field(most))
     options = GraspOptions(
         friction=query.friction,
         samples=query.samples,

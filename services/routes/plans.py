@@ -106,8 +106,7 @@ def plan(request: Request, served: ServedAfterFrames, service: Service, query: _
             field="rate",
             hint=hint,
         )
-    scope = found.scope(n_sigma=served.field.n_sigma, unknown=query.unknown, confidence=query.confidence)
-    covers = scope | {"map_gaussians": len(served.ready.model), "support_plane": around.covers_support}
+    covers = found.scope(around, confidence=query.confidence)
     kept = service.plans.add(served, robot.name, base, result, trajectory, source.why, covers)
     service.store.tell(served, PLAN, trajectory)
     return answer(request, _description(kept, query.rate))

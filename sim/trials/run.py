@@ -16,14 +16,13 @@ from typing import Any
 import torch
 
 from splatbot.errors import FormatError, InputError, SplatbotError
+from splatbot.sim.picking import MOST_MOVED
 from splatbot.sim.trials.scenes import FAMILIES, make_trial
 from splatbot.sim.trials.stacks import GaussianStack, LookingStack, Stack
 from splatbot.sim.trials.trial import TrialRow, run_trial
 
 FILE = "trials.jsonl"
 STACKS = ("gaussians", "gaussians_look", "mesh", "cloud")
-MOST_MOVED = 0.1
-"""Largest push of a target [m]; it may not reach its neighbours."""
 OnProgress = Callable[[str, float], None]
 
 

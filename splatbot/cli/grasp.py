@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from splatbot.cli.paths import check_file, check_output
-from splatbot.cli.placing import Pose, base_pose, base_words, margin_value, pose_values, run_folder
+from splatbot.cli.placing import Pose, base_pose, base_words, map_obstacles, margin_value, pose_values, run_folder
 from splatbot.errors import InputError, SplatbotError
 from splatbot.layouts import map_file
 
@@ -146,7 +146,7 @@ def grasp(
         tell("auditing the error of the map")
         margin_text = _set_margin(sampler, "0" if hand_only and margin is None else margin, map, found)
         if not hand_only:
-            tell("searching for unknown space")
+            tell("collecting the obstacles of plans")
             _agree_with_plans(sampler, map, arm, unknown)
         tell(f"searching for grasps of {found.label}")
         result = objects.with_notes(sampler.sample(found, options))
@@ -288,31 +288,15 @@ def _set_margin(sampler: GraspSampler, margin: str | None, map_: Path, target: T
 
 
 def _agree_with_plans(sampler: GraspSampler, map_: Path, arm: RobotModel, policy: UnknownPolicy) -> None:
-    """Limit the pre-grasps to ends of plans from home.
-
-    Raises:
-        InputError: the policy needs a run.
-        FormatError: the run is damaged.
-        LogError: its log is damaged.
-    """
+    """Limit the pre-grasps to ends of plans from home; for errors see :func:`splatbot.cli.placing.map_obstacles`."""
     from splatbot.collision import GaussianCollisionField, RobotSpheres
     from splatbot.gaussians import GaussianModel
-    from splatbot.results.plan_obstacles import PlanObstacles
-    from splatbot.results.unknown import field_of, unknown_in_reach
-    from splatbot.robots.in_view import reopen_log
-    from splatbot.workspace import find_workspace
 
-    solids, most = None, max(sampler.margin, sampler.arm_margin)
-    spheres = RobotSpheres(arm, T_world_base=sampler.scene.T_world_base)
-    if policy != "free":
-        run = run_folder(map_, "--unknown")
-        space = unknown_in_reach(run, reopen_log(run), spheres)
-        solids = field_of(space, policy, spheres, arm.home, margin=most)
-    model, known = GaussianModel.load(map_file(map_)), find_workspace(map_)
-    plane = None if known is None else known.support_plane
+    model, most = GaussianModel.load(map_file(map_)), max(sampler.margin, sampler.arm_margin)
     field = GaussianCollisionField(model, min_observations=sampler.min_observations)
-    around = PlanObstacles(field, model, spheres, arm.home, plane=plane)
-    sampler.agree_with_plans(around.field(most), solids)
+    spheres = RobotSpheres(arm, T_world_base=sampler.scene.T_world_base)
+    around = map_obstacles(map_, field, model, spheres, arm.home, unknown=policy)
+    sampler.agree_with_plans(around.field(most), around.unknown_field(most))
 
 
 def _print(result: GraspResult, folder: Path, margin: str, *, verbose: bool) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -69,19 +69,21 @@ def pick(
     from splatbot.cli.affordances import name_backends
     from splatbot.grasping.options import GraspOptions
     from splatbot.grasping.pick_types import PickError, PickOptions
-    from splatbot.sim.picking import pick_in_twin
+    from splatbot.sim.picking import MOST_MOVED, pick_in_twin
     from splatbot.sim.scene import load_scene
     from splatbot.sim.twin import Twin
 
     backends = name_backends(vlm=vlm)
-    if not 0.0 <= moved <= 0.2:
-        raise InputError(f"is {moved:g}.", field="--moved", hint="give metres, 0 to 0.2")
+    if not 0.0 <= moved <= MOST_MOVED:
+        raise InputError(f"is {moved:g}.", field="--moved", hint=f"give metres, 0 to {MOST_MOVED:g}")
     options = PickOptions(
         lift=lift, force=force, tries=tries, grasp=GraspOptions(seed=seed), attempts=attempts, seed=seed
     )
     twin = Twin(load_scene(scene))
-    settings: dict[str, Any] = {"views": views, "margin": margin, "home": home, "look": look, "moved": moved}
-    picked = pick_in_twin(twin, target, backends, options, seed=seed, **settings)
+    picked = pick_in_twin(
+        twin, target, backends, options,
+        views=views, margin=margin, home=home, look=look, moved=moved, seed=seed,
+    )  # fmt: skip
     folder = out if out is not None else Path("runs") / "pick"
     folder.mkdir(parents=True, exist_ok=True)
     with atomic_write(folder / "pick.json") as handle:

@@ -9,7 +9,11 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from splatbot.collision import GaussianCollisionField, RobotSpheres
+    from splatbot.collision.unknown import UnknownPolicy
+    from splatbot.gaussians import GaussianModel
     from splatbot.results.folder import RunFolder
+    from splatbot.results.plan_obstacles import PlanObstacles
 
 Pose = tuple[float, float, float, float, float, float, float]
 
@@ -73,6 +77,46 @@ def run_folder(map_: Path, flag: str) -> RunFolder:
     if not map_.is_dir():
         raise InputError("needs a run folder.", field=flag, hint="give the folder that `splatbot map` wrote")
     return RunFolder(map_)
+
+
+def map_obstacles(
+    map_: Path,
+    field: GaussianCollisionField,
+    model: GaussianModel,
+    arm: RobotSpheres,
+    start: NDArray[np.float64],
+    *,
+    unknown: UnknownPolicy,
+    support: bool = True,
+) -> PlanObstacles:
+    """Return the obstacles of plans in a map: its Gaussians, the plane of its scene.yaml, and its unknown space.
+
+    Args:
+        map_: run folder or map file.
+        field: collision field of the map.
+        model: the map.
+        arm: the arm.
+        start: (J,) configuration at which it is [rad or m].
+        unknown: treatment of unknown space, which takes seconds to find unless it is free.
+        support: whether the support plane of the scene.yaml is an obstacle.
+
+    Raises:
+        InputError: unknown space is not free, and the map is in no run's folder.
+        FormatError: the run or the scene.yaml is damaged.
+        LogError: the log of the run is damaged.
+    """
+    from splatbot.results.plan_obstacles import PlanObstacles
+    from splatbot.results.unknown import unknown_in_reach
+    from splatbot.robots.in_view import reopen_log
+    from splatbot.workspace import find_workspace
+
+    space = None
+    if unknown != "free":
+        run = run_folder(map_, "--unknown")
+        space = unknown_in_reach(run, reopen_log(run), arm)
+    known = find_workspace(map_) if support else None
+    plane = None if known is None else known.support_plane
+    return PlanObstacles(field, model, arm, start, plane=plane, space=space, policy=unknown)
 
 
 def margin_value(text: str) -> float:

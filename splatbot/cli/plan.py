@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from splatbot.cli.paths import check_file, check_output
-from splatbot.cli.placing import Pose, base_pose, base_words, checked_pose, margin_value, pose_values, run_folder
+from splatbot.cli.placing import (
+    Pose,
+    base_pose,
+    base_words,
+    checked_pose,
+    map_obstacles,
+    margin_value,
+    pose_values,
+    run_folder,
+)
 from splatbot.errors import InputError
 from splatbot.layouts import map_file
 
@@ -19,8 +28,9 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from splatbot.collision import GaussianCollisionField, RobotSpheres, UnknownSpace
+    from splatbot.collision import GaussianCollisionField
     from splatbot.planning import GaussianRRTStar, JointTrajectory, PlanResult
+    from splatbot.planning import Path as JointPath
     from splatbot.planning.closest import ClosestApproach
     from splatbot.results.region_plan import RegionPlan
     from splatbot.robots.robot import RobotModel
@@ -104,7 +114,6 @@ def plan(
     from splatbot.planning import GaussianRRTStar, PoseGoal
     from splatbot.planning.closest import closest_approach
     from splatbot.report.plan_page import plan_html, plan_png
-    from splatbot.results.plan_obstacles import PlanObstacles
     from splatbot.robots.appearance import appearance, coarse_appearance
     from splatbot.robots.store import load_robot
 
@@ -122,19 +131,10 @@ def plan(
     with steps() as tell:
         tell("loading the map")
         of_map = GaussianCollisionField(model, n_sigma, min_observations=min_observations)
-        space = None
         if unknown != "free":
             tell("searching for unknown space")
-            space = _unknown_space(map, RobotSpheres(arm, T_world_base=T_world_base))
-        around = PlanObstacles(
-            of_map,
-            model,
-            RobotSpheres(arm, T_world_base=T_world_base),
-            here,
-            plane=_support_plane(map) if support else None,
-            space=space,
-            policy=unknown,
-        )
+        spheres = RobotSpheres(arm, T_world_base=T_world_base)
+        around = map_obstacles(map, of_map, model, spheres, here, unknown=unknown, support=support)
         found = _plan(
             map,
             of_map,
@@ -150,9 +150,8 @@ def plan(
     around.check(result)
     result.unwrap()
     assert trajectory is not None
-    scope = found.scope(n_sigma=n_sigma, unknown=unknown, confidence=confidence)
-    covers = scope | {"map_gaussians": len(of_map), "support_plane": around.covers_support}
-    nearest = closest_approach(found.planner.arm, found.planner.field, trajectory)
+    covers = found.scope(around, confidence=confidence)
+    nearest = closest_approach(found.planner.arm, found.planner.field, trajectory, around.kind)
     folder = out if out is not None else Path("runs") / "plan"
     title = f"{arm.name} in {map.resolve().name}"
     texts = {
@@ -171,8 +170,7 @@ def plan(
     of_arm = (appearance(arm), arm.fk, arm.T_link_tcp)
     picture = plan_png(model, found.planner.arm, trajectory, *of_arm, nearest=nearest)
     replace_files(folder, writers | {"plan.png": write_bytes(picture)})
-    what = None if nearest is None else around.kind(nearest.gaussian)
-    _print(result, trajectory, covers, None if nearest is None or what is None else (nearest, what), folder)
+    _print(result, trajectory, covers, nearest, folder)
     if grasp is not None:
         print_text(
             f"the approach to the grasp is not part of this plan: approach_path of {grasp}, certified when found"
@@ -180,26 +178,6 @@ def plan(
     next_ = f"splatbot twin --map {map} --robot {robot}{base_words(base)} --trajectory {folder / 'trajectory.json'}"
     print_text(f"next: {next_}")
     return 0
-
-
-def _unknown_space(map_: Path, arm: RobotSpheres) -> UnknownSpace:
-    """Find the unknown space within reach of an arm.
-
-    Raises:
-        InputError: the map is in no run's folder.
-    """
-    from splatbot.results.unknown import unknown_in_reach
-    from splatbot.robots.in_view import reopen_log
-
-    run = run_folder(map_, "--unknown")
-    return unknown_in_reach(run, reopen_log(run), arm)
-
-
-def _support_plane(map_: Path) -> NDArray[np.float64] | None:
-    from splatbot.workspace import find_workspace
-
-    known = find_workspace(map_)
-    return None if known is None else known.support_plane
 
 
 def _plan(
@@ -319,7 +297,7 @@ def _print(
     result: PlanResult,
     trajectory: JointTrajectory,
     covers: dict[str, Any],
-    nearest: tuple[ClosestApproach, str] | None,
+    nearest: ClosestApproach | None,
     folder: Path,
 ) -> None:
     from splatbot.cli.tables import print_table
@@ -334,8 +312,8 @@ def _print(
         ("duration", f"{trajectory.duration:.3f} s"),
         ("certified", "yes" if c.certified else "NO"),
         ("clearance", clearance_text(c)),
-        *([] if nearest is None else [("nearest", nearest[0].describe(nearest[1]))]),
-        *([("close", _CLOSE)] if nearest is not None and nearest[0].close else []),
+        *([] if nearest is None else [("nearest", str(nearest))]),
+        *([("close", _CLOSE)] if nearest is not None and nearest.close else []),
         ("covers", f"moving links against the map at {covers['n_sigma']:g} sigma and against the arm itself"),
         ("base", _BASE_IN_MAP if covers["base_in_map"] else "not covered: the mounted link is not checked"),
         (
@@ -352,10 +330,12 @@ def _print(
     print_table(rows, title="planned")
 
 
-def _detour(path: Any) -> float:
+def _detour(path: JointPath) -> float:
     """Return the length of a path in terms of the distance between its ends."""
-    direct = float(((path.waypoints[-1] - path.waypoints[0]) ** 2).sum() ** 0.5)
-    return float(path.cost) / direct if direct > 0.0 else 1.0
+    import numpy as np
+
+    direct = float(np.linalg.norm(path.waypoints[-1] - path.waypoints[0]))
+    return path.cost / direct if direct > 0.0 else 1.0
 
 
 def _margin_text(covers: dict[str, Any]) -> str:

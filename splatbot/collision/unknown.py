@@ -144,17 +144,16 @@ def find_unknown(aabb: ArrayLike, voxel: float, views: Iterable[DepthView]) -> U
     size = np.ceil((high - low) / voxel - 1e-9).astype(np.int64)
     radius, views = np.sqrt(3) / 2 * voxel, list(views)
     corners, in_image = _blocks(low, size, voxel, views)
-    cells = (corners[:, None] + np.moveaxis(np.indices((CONSTANTS.block,) * 3), 0, -1).reshape(1, -1, 3)).reshape(-1, 3)
-    block_of = np.repeat(np.arange(len(corners)), CONSTANTS.block**3)
-    inside = (cells < size).all(axis=1)
-    cells, block_of = cells[inside], block_of[inside]
-    centers = cells * voxel + low + voxel / 2
+    in_block = np.moveaxis(np.indices((CONSTANTS.block,) * 3), 0, -1).reshape(1, -1, 3)
+    cells = (corners[:, None] + in_block).reshape(-1, 3).astype(np.int32)
     open_, missing = np.zeros(len(cells), np.bool_), np.zeros(len(cells), np.int32)
     for view, met in zip(views, in_image, strict=True):
-        left = np.flatnonzero(~open_ & met[block_of])
-        empty, lacks_depth = _observed(centers[left], radius, view)
+        left = np.flatnonzero(~open_ & np.repeat(met, CONSTANTS.block**3))
+        empty, lacks_depth = _observed(cells[left] * voxel + low + voxel / 2, radius, view)
         open_[left[empty]] = True
         missing[left[lacks_depth]] += 1
+    inside = (cells < size).all(axis=1)  # the last blocks extend beyond the box
+    cells, open_, missing = cells[inside], open_[inside], missing[inside]
     unknown, suspect = np.ones(tuple(size), np.bool_), np.zeros(tuple(size), np.bool_)
     unknown[tuple(cells.T)] = ~open_
     suspect[tuple(cells.T)] = ~open_ & (missing >= CONSTANTS.suspect_views)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -169,8 +169,10 @@ class GaussianModel:
 
     @staticmethod
     def concatenate(models: Sequence[GaussianModel]) -> GaussianModel:
-        """Return the union of models of one SH degree, in order."""
-        columns = zip(*(m._tensors() for m in models), strict=True)
+        """Return the union of models, in order; harmonics of lower degrees than the highest are continued by zeros."""
+        most = max(m.sh.shape[1] for m in models)
+        padded = [replace(m, sh=torch.nn.functional.pad(m.sh, (0, 0, 0, most - m.sh.shape[1]))) for m in models]
+        columns = zip(*(m._tensors() for m in padded), strict=True)
         return GaussianModel(*(torch.cat(column) for column in columns))
 
     def _tensors(self) -> tuple[Tensor, ...]:

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from splatbot.collision import GaussianCollisionField
 from splatbot.collision.visibility import DepthView, measured_depths
-from splatbot.geometry import inverse, transform_points
+from splatbot.geometry import frame_along, inverse, transform_points
 from splatbot.grasping.hands import Hands
 from splatbot.grasping.measured import hand_penetration
 from splatbot.grasping.surface import GraspSurface
@@ -70,8 +70,6 @@ class LookConstants:
 
 
 CONSTANTS = LookConstants()
-
-
 _HIDDEN = "the image does not show it"
 
 
@@ -91,7 +89,8 @@ class Relocation:
     """Where a look found the target.
 
     Args:
-        T_now_before: (4, 4) motion of the target since it was mapped, in the world [m]; the identity within noise.
+        T_now_before: (4, 4) motion of the target since it was mapped, in the world [m]; the identity within noise, and
+            if it was not found.
         shift: distance by which its middle moved [m].
         turn: angle by which it turned [rad].
         share: share of the shown surface points that agree with depth.
@@ -139,7 +138,7 @@ def relocate(scene: SegmentedMap, surface: GraspSurface, view: DepthView) -> Rel
     cosine = (surface.normals * to_camera).sum(axis=1) / np.linalg.norm(to_camera, axis=1)
     source = surface.points[surface.observed & (cosine > CONSTANTS.facing)]
     if len(source) < CONSTANTS.min_points or len(seen) < CONSTANTS.min_points:
-        return Relocation(np.eye(4), 0.0, 0.0, 0.0, min(len(source), len(seen)), _HIDDEN, shown=False)
+        return _unmoved(_Fit(np.eye(4), CONSTANTS.close, 0.0, min(len(source), len(seen))), _HIDDEN, shown=False)
     target = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(seen)).voxel_down_sample(CONSTANTS.voxel)
     target.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(radius=4 * CONSTANTS.voxel, max_nn=20))
     tree = cKDTree(np.asarray(target.points))
@@ -211,13 +210,11 @@ def _points(view: DepthView) -> Array:
 
 def _shifted(source: Array, tree: cKDTree, normals: Array, up: Array) -> list[Array]:
     """Register points (P, 3) to depth with normals (S, 3) by shifts alone; return a pose (4, 4) for each start."""
-    x = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
-    x /= np.linalg.norm(x)
-    y = np.cross(up, x)
+    in_plane = frame_along(up)[:, :2]
     poses = []
-    for a, b in itertools.product(CONSTANTS.starts, CONSTANTS.starts):
+    for start in itertools.product(CONSTANTS.starts, CONSTANTS.starts):
         T = np.eye(4)
-        T[:3, 3] = a * x + b * y
+        T[:3, 3] = in_plane @ start
         for reach in CONSTANTS.reaches:
             away, nearest = tree.query(source + T[:3, 3], distance_upper_bound=reach)
             pairs = np.isfinite(away)
@@ -266,18 +263,21 @@ def _fit(T: Array, source: Array, tree: cKDTree, view: DepthView) -> _Fit:
 
 
 def _judged(fit: _Fit, middle: Array) -> Relocation:
-    T, share, points = fit.T, fit.share, fit.points
-    shift, turn = float(np.linalg.norm(transform_points(T, middle) - middle)), _angle(T)
-    reason = ""
-    if points < CONSTANTS.min_points:
-        return Relocation(np.eye(4), 0.0, 0.0, share, points, _HIDDEN, shown=False)
-    if share < CONSTANTS.min_share:
-        reason = f"only {100 * share:.0f} % of its surface agrees with depth"
-    elif shift > CONSTANTS.max_shift or turn > CONSTANTS.max_turn:
-        reason = f"it moved by {1e3 * shift:.0f} mm and {np.degrees(turn):.0f} degrees"
-    if reason or (shift <= CONSTANTS.noise[0] and turn <= CONSTANTS.noise[1]):
-        return Relocation(np.eye(4), shift if reason else 0.0, turn if reason else 0.0, share, points, reason)
-    return Relocation(T, shift, turn, share, points)
+    shift, turn = float(np.linalg.norm(transform_points(fit.T, middle) - middle)), _angle(fit.T)
+    if fit.points < CONSTANTS.min_points:
+        return _unmoved(fit, _HIDDEN, shown=False)
+    if fit.share < CONSTANTS.min_share:
+        return _unmoved(fit, f"only {100 * fit.share:.0f} % of its surface agrees with depth")
+    if shift > CONSTANTS.max_shift:
+        return _unmoved(fit, f"it moved by {1e3 * shift:.0f} mm")
+    if shift <= CONSTANTS.noise[0] and turn <= CONSTANTS.noise[1]:
+        return _unmoved(fit)
+    return Relocation(fit.T, shift, turn, fit.share, fit.points)
+
+
+def _unmoved(fit: _Fit, reason: str = "", *, shown: bool = True) -> Relocation:
+    """Return a result that corrects nothing."""
+    return Relocation(np.eye(4), 0.0, 0.0, fit.share, fit.points, reason, shown)
 
 
 def _angle(T: Array) -> float:

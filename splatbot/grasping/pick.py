@@ -121,6 +121,7 @@ class _Pick:
         self.planning_seconds: float | None = None
         self.notes: list[str] = []
         self.left: list[tuple[int, Grasp]] = []
+        self.T_now_mapped = np.eye(4)
         self.attempts, self.shift = 0, None if picker.camera is None else 0.0
         self._began = time.perf_counter()
 
@@ -166,7 +167,7 @@ class _Pick:
         attempts += [(k, grasp, False) for k, grasp, avoid_moving in attempts if avoid_moving]
         reasons: list[str] = []
         for k, grasp, avoid_moving in attempts:
-            plan = self.planner.plan_to(grasp, start, avoid_moving=avoid_moving)
+            plan = self._plan_to(grasp, start, avoid_moving)
             if isinstance(plan, PickPlan):
                 self.left = [(number, each) for number, each in self.left if number > k]
                 self.grasp, self.planning_seconds = plan.grasp, plan.planning_seconds
@@ -175,6 +176,16 @@ class _Pick:
                 return plan
             reasons.append(f"grasp {k}: {plan}")
         raise _EndedError(PickOutcome.NO_PLAN, "; ".join(reasons))
+
+    def _plan_to(self, grasp: Grasp, start: Array, avoid_moving: bool) -> PickPlan | str:
+        """Plan to a grasp of the target where the latest look found it; return the reason without a plan."""
+        if not np.array_equal(self.T_now_mapped, np.eye(4)):
+            assert isinstance(self.planner, MapPickPlanner)  # only a look moves a target
+            moved = self.planner.moved(grasp, self.T_now_mapped)
+            if moved is None:
+                return "the arm does not reach it at the target's new place"
+            grasp = moved
+        return self.planner.plan_to(grasp, start, avoid_moving=avoid_moving)
 
     def _note_moving(self, plan: PickPlan | Segment) -> None:
         """Append a note if a plan crosses regions where motion was observed."""
@@ -226,7 +237,7 @@ class _Pick:
         return plan
 
     def _adjusted(self, plan: PickPlan, T_now_before: Array) -> PickPlan:
-        """Move to the pre-grasp at the target's new place; grasps that are left move along."""
+        """Move to the pre-grasp at the target's new place."""
         self.stage = PickStage.ADJUST
         here = self.controller.step().position
         assert isinstance(self.planner, MapPickPlanner)
@@ -234,8 +245,7 @@ class _Pick:
         if isinstance(adjusted, str):
             raise _MissedError(PickOutcome.NO_PLAN, adjusted)
         self.s, self.planner, self.grasp = adjusted.sampler, adjusted.planner, adjusted.plan.grasp
-        moved = [(k, adjusted.planner.moved(grasp, T_now_before)) for k, grasp in self.left]
-        self.left = [(k, grasp) for k, grasp in moved if grasp is not None]
+        self.T_now_mapped = T_now_before @ self.T_now_mapped
         self._follow(PickStage.ADJUST, adjusted.plan.to_pregrasp, self.o.slow)
         return adjusted.plan
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Protocol
@@ -92,8 +91,8 @@ class ArmReach:
         whole: field of the whole map, of which the arm must be free at the pre-grasp. If None, this is not checked.
         margin: clearance that arm and hand keep from the map [m].
         arm_margin: the same for the links before the hand alone [m].
-        departure: fields that a plan to the pre-grasp avoids. At the pre-grasp the robot, with its hand fully open,
-            is farther than both margins from them.
+        departure: field of the plan to the pre-grasp. There the robot, with its hand fully open, keeps both margins
+            from it. If None, this is not checked.
         unknown: field of unknown space. The links before the hand keep both margins from it on the whole approach.
         seed: seed of inverse kinematics.
     """
@@ -107,7 +106,7 @@ class ArmReach:
         *,
         margin: float = 0.0,
         arm_margin: float = 0.0,
-        departure: Sequence[GaussianCollisionField] = (),
+        departure: GaussianCollisionField | None = None,
         unknown: GaussianCollisionField | None = None,
         seed: int = 0,
     ) -> None:
@@ -115,7 +114,7 @@ class ArmReach:
             if not 0.0 <= value < np.inf:
                 raise InputError(f"is {value}.", field=name, hint="give metres, 0 or more")
         self.robot, self.around, self.whole, self.seed = robot, around, whole, seed
-        self.departure = tuple(departure)
+        self.departure = departure
         stroke = hand_of(robot).stroke
 
         @cache
@@ -164,7 +163,7 @@ class ArmReach:
             if self.whole is not None and arm.check(self.whole, start[None]).in_collision[0]:
                 reason, kind = "the arm touches the target before it approaches", "have a blocked approach"
                 continue
-            if any(self._open.check(field, start[None]).in_collision[0] for field in self.departure):
+            if self.departure is not None and self._open.check(self.departure, start[None]).in_collision[0]:
                 reason, kind = "no plan may end at its pre-grasp", "start where no plan may end"
                 continue
             way = back.path.waypoints

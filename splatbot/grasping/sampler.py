@@ -76,7 +76,7 @@ class GraspSampler:
         self.raw = raw
         self.hand = hand_of(robot)
         self.margin, self.arm_margin, self.n_sigma = margin, arm_margin, n_sigma
-        self.departure: tuple[GaussianCollisionField, ...] = ()
+        self.departure: GaussianCollisionField | None = None
         self.unknown: GaussianCollisionField | None = None
         self.moving = None if moving is None or not len(moving) else np.asarray(moving, dtype=np.float64)
         self.min_observations = min_observations
@@ -87,11 +87,11 @@ class GraspSampler:
         """Offer only grasps whose pre-grasp a plan may end at.
 
         Args:
-            field: collision field of the map for plans, whose Gaussians are larger than those of the grasps.
-            unknown: field of unknown space, which plans avoid. If None, it counts as free.
+            field: collision field of plans, with all their obstacles.
+            unknown: field of unknown space alone, which the links before the hand avoid on the approach. If None, it
+                counts as free.
         """
-        self.departure = (field,) if unknown is None else (field, unknown)
-        self.unknown = unknown
+        self.departure, self.unknown = field, unknown
 
     def sample(self, target: Target, options: GraspOptions | None = None) -> GraspResult:
         """Sample ranked grasps of a target; a result without grasps holds the reasons.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.geometry import inverse, transform_points
+from splatbot.planning.problem import link_words, place_words
 from splatbot.planning.trajectory import JointTrajectory
 from splatbot.protocols import Array
 
@@ -40,7 +42,7 @@ class ClosestApproach:
         link: index of the nearest link.
         name: name of the joint that moves it.
         clearance: distance of that link from the map, less the margin [m].
-        gaussian: row of the nearest Gaussian in the model of the field.
+        obstacle: name of the obstacle.
         point: (3,) its nearest point [m, world].
         at_base: (3,) the same in the frame of the base [m].
     """
@@ -49,7 +51,7 @@ class ClosestApproach:
     link: int
     name: str
     clearance: float
-    gaussian: int
+    obstacle: str
     point: Array
     at_base: Array
 
@@ -58,12 +60,10 @@ class ClosestApproach:
         """Return whether the clearance is small compared with errors that the margin does not cover."""
         return self.clearance < CONSTANTS.close
 
-    def describe(self, what: str = "the map") -> str:
-        """Describe the moment, with the kind of obstacle that is near."""
-        place = ", ".join(f"{x:.2f}" for x in self.at_base)
-        named = f" (after {self.name})" if self.name else ""
-        away = f"{1e3 * self.clearance:.1f} mm beyond the margin from {what}"
-        return f"link {self.link}{named} at {self.time:.2f} s, {away} at ({place}) m from the base"
+    def __str__(self) -> str:
+        away = f"{1e3 * self.clearance:.1f} mm beyond the margin from {self.obstacle}"
+        place = place_words(self.at_base.tolist())
+        return f"{link_words(self.link, self.name)} at {self.time:.2f} s, {away} at {place}"
 
     def to_dict(self) -> dict[str, Any]:
         """Return the moment as JSON values."""
@@ -71,6 +71,7 @@ class ClosestApproach:
             "time_s": round(self.time, 3),
             "link": self.link,
             "joint": self.name,
+            "obstacle": self.obstacle,
             "clearance_m": self.clearance,
             "point_world_m": self.point.tolist(),
             "point_base_m": self.at_base.tolist(),
@@ -78,7 +79,10 @@ class ClosestApproach:
 
 
 def closest_approach(
-    arm: RobotSpheres, field: GaussianCollisionField, trajectory: JointTrajectory
+    arm: RobotSpheres,
+    field: GaussianCollisionField,
+    trajectory: JointTrajectory,
+    kind: Callable[[int], str] = lambda row: "the map",
 ) -> ClosestApproach | None:
     """Find the sampled moment at which an arm is nearest to a field; None if it is farther than 0.5 m.
 
@@ -86,6 +90,7 @@ def closest_approach(
         arm: collision spheres of the robot, with the pose of its base and the margin.
         field: collision field of the map, and of unknown space.
         trajectory: the trajectory.
+        kind: returns the name of the obstacle of a row of the field's model.
     """
     times = np.linspace(0.0, trajectory.duration, CONSTANTS.moments)
     q = trajectory.at(times).position
@@ -102,7 +107,7 @@ def closest_approach(
         link=link,
         name=trajectory.names[link - 1] if link > 0 else "",
         clearance=float(found.distance[k]),
-        gaussian=int(found.index[k]),
+        obstacle=kind(int(found.index[k])),
         point=point,
         at_base=transform_points(inverse(arm.T_world_base), point),
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -97,11 +98,25 @@ class Cause:
             return f"joint {self.joint}{named} is {self.depth:.4g} beyond its limit"
         if self.link < 0:
             return "no obstacle is found"
-        link = f"link {self.link}" + (f" (after {self.name})" if self.name else "")
         if self.other >= 0:
-            return f"{link} touches link {self.other}, {1e3 * self.depth:.1f} mm deep"
-        at = "" if self.at_base is None else f" at ({', '.join(f'{x:.2f}' for x in self.at_base)}) m from the base"
-        return f"{link} is {1e3 * self.depth:.1f} mm deep in the map{at}, in Gaussian {self.gaussian}"
+            return f"{link_words(self.link, self.name)} touches link {self.other}, {1e3 * self.depth:.1f} mm deep"
+        return f"{self.deep_in('the map')}, in Gaussian {self.gaussian}"
+
+    def deep_in(self, obstacle: str) -> str:
+        """Describe the contact of the link with an obstacle, and its place."""
+        at = "" if self.at_base is None else f" at {place_words(self.at_base)}"
+        deep = f"{1e3 * max(self.depth, 0.0):.1f} mm deep"
+        return f"{link_words(self.link, self.name)} is {deep} in {obstacle}{at}"
+
+
+def link_words(link: int, joint: str) -> str:
+    """Return the words for a link and the joint that moves it; "" for the base."""
+    return f"link {link}" + (f" (after {joint})" if joint else "")
+
+
+def place_words(at_base: Sequence[float]) -> str:
+    """Return the words for a point (3,) in the frame of the base [m]."""
+    return f"({', '.join(f'{x:.2f}' for x in at_base)}) m from the base"
 
 
 @dataclass(frozen=True, eq=False)

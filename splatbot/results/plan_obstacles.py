@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike
 from splatbot.collision import GaussianCollisionField, RobotSpheres, UnknownSpace
 from splatbot.collision.unknown import UnknownPolicy
 from splatbot.errors import SplatbotError
-from splatbot.gaussians import GaussianModel
-from splatbot.geometry import rotation_to_quat
+from splatbot.gaussians import GaussianModel, Snapshot
+from splatbot.geometry import frame_along, rotation_to_quat
 from splatbot.planning import PlanResult, PlanStatus
 from splatbot.protocols import Array
 from splatbot.results.unknown import CONSTANTS as UNKNOWN
@@ -62,26 +62,20 @@ def support_tiles(
     """
     n, d = np.asarray(plane, dtype=np.float64)[:3], float(np.asarray(plane)[3])
     base = arm.T_world_base[:3, 3]
-    height = float(n @ base + d)
-    centers, radii = (
-        arm.centers(np.asarray(occupied, dtype=np.float64)[None])[0],
-        arm.spheres.radii + margin + UNKNOWN.slack,
-    )
-    reach = float(arm.robot.chain.reach(_last_to_far(arm)))
-    if height < CONSTANTS.above or height > reach:
+    height, reach = float(n @ base + d), arm.robot.chain.reach(_last_to_far(arm))
+    if not CONSTANTS.above <= height <= reach:
         return GaussianModel.empty(0)
-    R = _frame(n)
-    steps = np.arange(-np.ceil(reach / CONSTANTS.spacing), np.ceil(reach / CONSTANTS.spacing) + 1) * CONSTANTS.spacing
+    R, spacing = frame_along(n), CONSTANTS.spacing
+    steps = np.arange(-np.ceil(reach / spacing), np.ceil(reach / spacing) + 1) * spacing
     x, y = (grid.ravel() for grid in np.meshgrid(steps, steps))
     inside = np.hypot(x, y) <= reach
-    foot = base - height * n
-    means = foot + np.outer(x[inside], R[:, 0]) + np.outer(y[inside], R[:, 1]) - CONSTANTS.thickness * n
-    # A sphere meets a tile at most where it meets the disc of the tile.
-    off = means[:, None] - centers[None]
-    along = np.abs(off @ n)
-    across = np.linalg.norm(off - (off @ n)[..., None] * n, axis=2)
-    met = (along < radii + CONSTANTS.thickness) & (across < radii + CONSTANTS.radius)
-    means = means[~met.any(axis=1)]
+    foot = base - (height + CONSTANTS.thickness) * n
+    means = foot + np.outer(x[inside], R[:, 0]) + np.outer(y[inside], R[:, 1])
+    centers = arm.centers(np.asarray(occupied, dtype=np.float64)[None])[0]
+    radii = arm.spheres.radii + margin + UNKNOWN.slack
+    low = np.abs((centers - foot) @ n) < radii + CONSTANTS.thickness  # near the plane; the others meet no tile
+    across = np.linalg.norm(((means[:, None] - centers[low]) @ R)[..., :2], axis=2)
+    means = means[~(across < radii[low] + CONSTANTS.radius).any(axis=1)]
     scales = np.array([CONSTANTS.radius, CONSTANTS.radius, CONSTANTS.thickness]) / n_sigma
     count = len(means)
     return GaussianModel.from_activated(
@@ -117,9 +111,14 @@ class PlanObstacles:
         space: UnknownSpace | None = None,
         policy: UnknownPolicy = "free",
     ) -> None:
-        self._field, self._model, self._arm = field, model, arm
-        self._start, self._plane, self._space, self._policy = np.asarray(start), plane, space, policy
+        self._field, self._model, self._arm, self.policy = field, model, arm, policy
+        self._start, self._plane, self._space = np.asarray(start), plane, space
         self._tiles = 0
+
+    @property
+    def map_field(self) -> GaussianCollisionField:
+        """Collision field of the map alone."""
+        return self._field
 
     @property
     def covers_support(self) -> bool:
@@ -127,23 +126,31 @@ class PlanObstacles:
         return self._tiles > 0
 
     def field(self, margin: float) -> GaussianCollisionField:
-        """Return the field for plans with a margin [m]; solids that the arm touches at the start are left out."""
-        parts = [self._model]
-        self._tiles = 0
+        """Return the field for plans with a margin [m]; solids that the arm touches at the start are left out.
+
+        It shares the Gaussians of the map with the field of the map, and its version and gates.
+        """
+        tiles = GaussianModel.empty(0)
         if self._plane is not None:
-            n_sigma = self._field.n_sigma
-            parts.append(support_tiles(self._plane, self._arm, self._start, margin=margin, n_sigma=n_sigma))
-            self._tiles = len(parts[-1])
-        if self._space is not None:
-            parts.append(obstacles(self._space, self._policy, self._arm, self._start, margin=margin))
-        if sum(len(part) for part in parts[1:]) == 0:
+            tiles = support_tiles(self._plane, self._arm, self._start, margin=margin, n_sigma=self._field.n_sigma)
+        self._tiles = len(tiles)
+        solids = GaussianModel.concatenate([tiles, self._unknown(margin)])
+        if not len(solids):
             return self._field
-        solids = [_of_degree(part, self._model.sh_degree) for part in parts[1:] if len(part)]
-        return GaussianCollisionField(
-            GaussianModel.concatenate([self._model, *solids]),
-            self._field.n_sigma,
-            min_observations=self._field.gate.min_observations,
-        )
+        # No gate on observations removes a solid.
+        solids = replace(solids, observations=torch.full((len(solids),), _ALWAYS, dtype=torch.int32))
+        joined = Snapshot(GaussianModel.concatenate([self._model, solids]), map_version=self._field.map_version)
+        return self._field.updated(joined, np.zeros(len(joined.model), np.bool_))
+
+    def unknown_field(self, margin: float) -> GaussianCollisionField | None:
+        """Return the field of unknown space alone for plans with a margin [m], or None if it counts as free."""
+        solids = self._unknown(margin)
+        return GaussianCollisionField(solids) if len(solids) else None
+
+    def _unknown(self, margin: float) -> GaussianModel:
+        if self._space is None:
+            return GaussianModel.empty(0)
+        return obstacles(self._space, self.policy, self._arm, self._start, margin=margin)
 
     def kind(self, gaussian: int) -> Kind:
         """Return the kind of obstacle of a row in the latest field."""
@@ -164,18 +171,12 @@ class PlanObstacles:
         kind = self.kind(cause.gaussian)
         if kind == "the map":
             return
-        named = f" (after {cause.name})" if cause.name else ""
-        what = _MEANINGS[self._policy] if kind == "unknown space" else "the support plane of the scene.yaml"
-        place = "" if cause.at_base is None else f" at ({', '.join(f'{x:.2f}' for x in cause.at_base)}) m from the base"
+        what = _MEANINGS[self.policy] if kind == "unknown space" else "the support plane of the scene.yaml"
         hints = {
             "unknown space": "map the place from more views, give another goal, or let unknown space be free",
             "the support plane": "give another goal, correct the plane in scene.yaml, or leave it out (`--no-support`)",
         }
-        raise UnmappedObstacleError(
-            f"link {cause.link}{named} is {1e3 * max(cause.depth, 0.0):.1f} mm deep in {what}{place}.",
-            field=ends[result.status],
-            hint=hints[kind],
-        )
+        raise UnmappedObstacleError(f"{cause.deep_in(what)}.", field=ends[result.status], hint=hints[kind])
 
 
 _ALWAYS = 1 << 30  # observations of solids
@@ -198,17 +199,3 @@ def _last_to_far(arm: RobotSpheres) -> Array:
     T = np.eye(4)
     T[2, 3] = float((np.linalg.norm(arm.spheres.centers[last], axis=1) + arm.spheres.radii[last]).max())
     return T
-
-
-def _frame(n: Array) -> Array:
-    """Return a rotation (3, 3) whose z axis is the unit vector n (3,)."""
-    x = np.cross(np.eye(3)[int(np.argmin(np.abs(n)))], n)
-    x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(n, x), n], axis=1)
-
-
-def _of_degree(model: GaussianModel, degree: int) -> GaussianModel:
-    """Return solids with harmonics of another degree, all 0 beyond the first; no gate of observations removes them."""
-    sh = torch.zeros(len(model), (degree + 1) ** 2, 3)
-    sh[:, 0] = model.sh[:, 0]
-    return replace(model, sh=sh, observations=torch.full((len(model),), _ALWAYS, dtype=torch.int32))

@@ -13,6 +13,7 @@ from splatbot.errors import InputError
 from splatbot.planning import GaussianRRTStar, JointTrajectory, Path, PlanResult, time_path
 from splatbot.protocols import Array, HasHand
 from splatbot.results.margin import AuditedError
+from splatbot.results.plan_obstacles import PlanObstacles
 
 
 @dataclass(frozen=True)
@@ -53,25 +54,25 @@ class RegionPlan:
     points: int | None
     error: float | None
 
-    def scope(self, *, n_sigma: float, unknown: str, confidence: float) -> dict[str, Any]:
+    def scope(self, around: PlanObstacles, *, confidence: float) -> dict[str, Any]:
         """Describe the scope of the certificate: obstacles, unknown space, and the origin of the margin.
 
         The base is not checked, but ``base_in_map`` says whether more than its foot is in the map.
 
         Args:
-            n_sigma: surface of the map's Gaussians, in standard deviations.
-            unknown: how unknown space counts: "free", "cautious" or "occupied".
+            around: obstacles of the plan.
             confidence: share of the measured surface that an audited margin covers.
         """
         audited, margin, robot = self.points is not None, self.planner.margin, self.planner.arm.robot
         return {
-            "map_gaussians": len(self.planner.field),
-            "n_sigma": n_sigma,
+            "map_gaussians": len(around.map_field),
+            "n_sigma": around.map_field.n_sigma,
             "self_collision": True,
             "base": False,
             "hand": isinstance(robot, HasHand) and robot.hand is not None,
             "base_in_map": self.planner.arm.base_in_map_above(self.planner.field, CONSTANTS.base_foot),
-            "unknown_space": unknown,
+            "support_plane": around.covers_support,
+            "unknown_space": around.policy,
             "margin_m": margin,
             "margin_from": "audit" if audited else "user" if margin > 0 else "none",
             "confidence": confidence if audited else None,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from splatbot.collision import GaussianCollisionField, RobotSpheres, UnknownSpace, find_unknown
+from splatbot.collision import RobotSpheres, UnknownSpace, find_unknown
 from splatbot.collision.unknown import UnknownPolicy
 from splatbot.gaussians import GaussianModel
 from splatbot.logs import Log
@@ -69,11 +69,3 @@ def obstacles(
     q = np.atleast_2d(np.asarray(occupied, dtype=np.float64))
     centers, radii = arm.centers(q).reshape(-1, 3), np.tile(arm.spheres.radii + margin + CONSTANTS.slack, len(q))
     return space.without(np.c_[centers, radii]).solids(policy=policy)
-
-
-def field_of(
-    space: UnknownSpace, policy: UnknownPolicy, arm: RobotSpheres, start: ArrayLike, *, margin: float = 0.0
-) -> GaussianCollisionField | None:
-    """Return the field of :func:`obstacles` alone, or None without obstacles."""
-    solids = obstacles(space, policy, arm, start, margin=margin)
-    return GaussianCollisionField(solids) if len(solids) else None

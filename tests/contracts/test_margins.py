@@ -91,6 +91,7 @@ def test_unknown_space_is_an_obstacle_where_it_is_asked_for(service: Service) ->
     assert "panda_joint" in blocked.json()["detail"]
     wary = plan(service, "placed", unknown="cautious", margin=0, base=None).json()
     assert wary["covers"]["unknown_space"] == "cautious"
+    assert wary["map_version"] == 1  # the solids of unknown space are no other version
     assert plan(service, "placed", margin=0).json()["covers"]["unknown_space"] == "free"
     refused = plan(service, "bare", unknown="cautious", base=None)
     assert (refused.status_code, refused.json()["field"]) == (422, "unknown")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -124,6 +125,24 @@ def test_a_base_that_stands_in_the_map_is_reported(run: RunCommand, map_file: Pa
     answer = run("plan", "--map", map_file, *sunk, "--out", tmp_path / "out")
     assert answer.code == 0, answer.err
     assert "more of the mounted link than its foot is in the map; check --base" in answer.out
+
+
+def test_a_map_with_harmonics_and_a_support_plane_is_planned_in_and_drawn(run: RunCommand, tmp_path: Path) -> None:
+    model = tabletop().gaussians(4000)
+    replace(model, sh=model.sh.repeat(1, 16, 1) * 0.1).save(tmp_path / "map.ply")
+    Workspace(T_world_base=np.eye(4), support_plane=np.array([0.0, 0.0, 1.0, 0.0])).save(tmp_path / "scene.yaml")
+    words = ("plan", "--map", tmp_path / "map.ply", "--start", "home", "--out", tmp_path / "out")
+    answer = run(*words, "--goal", *GOAL)
+    assert answer.code == 0, answer.err
+    covers = json.loads((tmp_path / "out" / "plan.json").read_text())["covers"]
+    assert covers["support_plane"]
+    assert covers["map_gaussians"] == len(model)
+    assert cv2.imread(str(tmp_path / "out" / "plan.png")) is not None
+    below = run(*words, "--goal-pose", 0.4, 0.3, -0.1, 0, 1, 0, 0)
+    assert below.code == 1
+    assert "in the support plane of the scene.yaml at" in below.err
+    assert run(*words, "--goal", *GOAL, "--no-support").code == 0
+    assert not json.loads((tmp_path / "out" / "plan.json").read_text())["covers"]["support_plane"]
 
 
 def test_the_base_is_taken_from_the_scene_file_of_the_map_and_a_pose_is_reached(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -89,6 +90,18 @@ def test_harmonics_of_no_known_degree_are_refused() -> None:
             anchors=model.anchors,
         )
     assert caught.value.field == "sh"
+
+
+def test_models_of_several_degrees_are_joined_with_zeros_for_the_missing_harmonics() -> None:
+    flat = GaussianModel.from_activated(
+        means=np.zeros((2, 3)), quats=np.eye(4)[:2], scales=np.ones((2, 3)), opacities=[0.5, 0.6], colors=np.eye(3)[:2]
+    )
+    rich = replace(flat, sh=torch.arange(2 * 9 * 3, dtype=torch.float32).reshape(2, 9, 3))
+    joined = GaussianModel.concatenate([flat, rich, GaussianModel.empty(1)])
+    assert (len(joined), joined.sh_degree) == (4, 2)
+    torch.testing.assert_close(joined.sh[:2, :1], flat.sh)
+    assert not joined.sh[:2, 1:].any()
+    torch.testing.assert_close(joined.sh[2:], rich.sh)
 
 
 def test_select_and_concatenate_are_inverse() -> None:

@@ -245,7 +245,8 @@ def test_a_pregrasp_is_where_a_plan_may_end_and_the_arm_stays_out_of_unknown_spa
     )
     sampler = GraspSampler(scene(), panda(), arm_margin=margin)
     plans = GaussianCollisionField(scene().model, 2.0)
-    sampler.agree_with_plans(plans, GaussianCollisionField(ball, 2.0))
+    both = GaussianCollisionField(GaussianModel.concatenate([scene().model, ball]), 2.0)
+    sampler.agree_with_plans(both, GaussianCollisionField(ball, 2.0))
     result = sampler.sample(target, few)
     assert result.grasps
     assert result.rejected["hands: start where no plan may end"] > 0

@@ -61,8 +61,10 @@ def test_the_nearest_point_is_as_far_from_the_arm_as_the_gap_says(
     assert away[own].min() - MARGIN == pytest.approx(nearest.clearance, abs=1e-5)
     np.testing.assert_allclose(transform_points(T_WORLD_BASE, nearest.at_base), nearest.point, atol=1e-9)
     assert nearest.name == trajectory.names[nearest.link - 1]
-    assert "from the map at" in nearest.describe()
-    assert "from unknown space at" in nearest.describe("unknown space")
+    assert "from the map at" in str(nearest)
+    other = closest_approach(arm, field, trajectory, lambda row: f"obstacle {row}")
+    assert other is not None
+    assert "from obstacle " in str(other)
     assert not replace(nearest, clearance=0.0021).close
     assert replace(nearest, clearance=0.0019).close
 

@@ -10,7 +10,7 @@ import pytest
 from splatbot.bench.tabletop import tabletop
 from splatbot.collision import GaussianCollisionField, RobotSpheres, UnknownSpace
 from splatbot.errors import SplatbotError
-from splatbot.gaussians import GaussianModel
+from splatbot.gaussians import GaussianModel, Snapshot
 from splatbot.geometry import se3_exp, transform_points
 from splatbot.planning import GaussianRRTStar, PoseGoal
 from splatbot.results.plan_obstacles import CONSTANTS, PlanObstacles, support_tiles
@@ -109,6 +109,22 @@ def test_kinds_of_obstacles_are_told_apart_in_a_map_with_harmonics() -> None:
     plain = PlanObstacles(GaussianCollisionField(rich), rich, arm, robot.home)
     assert len(plain.field(MARGIN)) == len(rich)
     assert CONSTANTS.radius > CONSTANTS.spacing / np.sqrt(2)
+
+
+def test_the_field_of_a_plan_keeps_the_version_and_the_gates_of_the_map() -> None:
+    robot = load_robot("panda")
+    arm = RobotSpheres(robot)
+    model = tabletop().gaussians(2000)
+    model.observations[:500] = 1
+    model.observations[500:] = 5
+    field = GaussianCollisionField(Snapshot(model, map_version=7), 2.0, min_opacity=0.2, min_observations=3)
+    around = PlanObstacles(field, model, arm, robot.home, plane=np.array([0.0, 0.0, 1.0, 0.3]))
+    found = around.field(MARGIN)
+    tiles = support_tiles([0.0, 0.0, 1.0, 0.3], arm, robot.home, margin=MARGIN)
+    assert found.map_version == 7
+    assert len(found) == len(field) + len(tiles)  # gated Gaussians stay out, tiles stay in
+    assert (found.gate, found.n_sigma) == (field.gate, field.n_sigma)
+    assert around.unknown_field(MARGIN) is None
 
 
 @pytest.mark.parametrize(
