@@ -113,7 +113,7 @@ def grasp(
     from splatbot.atomic import atomic_write
     from splatbot.cli.affordances import name_backends
     from splatbot.cli.progress import steps
-    from splatbot.cli.tables import print_text
+    from splatbot.cli.tables import print_command
     from splatbot.grasping.advice import first_change
     from splatbot.grasping.affordance import find_target
     from splatbot.grasping.object_list import stroke_of
@@ -176,7 +176,7 @@ def grasp(
         on = f"--map {map} --robot {robot}{base_words(base)}"
         on += "" if unknown == "free" else f" --unknown {unknown}"
         on += "" if min_observations == 1 else f" --min-observations {min_observations}"
-        print_text(f"next: splatbot plan {on} --start home --grasp {folder / 'grasp.json'}")
+        print_command(f"splatbot plan {on} --start home --grasp {folder / 'grasp.json'}")
     return 0
 
 

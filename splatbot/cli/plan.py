@@ -108,7 +108,7 @@ def plan(
 
     from splatbot.atomic import replace_files, write_bytes, write_text
     from splatbot.cli.progress import steps
-    from splatbot.cli.tables import print_text
+    from splatbot.cli.tables import print_command, print_text
     from splatbot.collision import GaussianCollisionField, RobotSpheres
     from splatbot.gaussians import GaussianModel
     from splatbot.planning import GaussianRRTStar, PoseGoal
@@ -175,8 +175,8 @@ def plan(
         print_text(
             f"the approach to the grasp is not part of this plan: approach_path of {grasp}, certified when found"
         )
-    next_ = f"splatbot twin --map {map} --robot {robot}{base_words(base)} --trajectory {folder / 'trajectory.json'}"
-    print_text(f"next: {next_}")
+    of_plan = f"--map {map} --robot {robot}{base_words(base)} --trajectory {folder / 'trajectory.json'}"
+    print_command(f"splatbot twin {of_plan}")
     return 0
 
 

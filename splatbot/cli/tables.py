@@ -32,6 +32,11 @@ def print_text(text: str) -> None:
     print("\n".join(fitted(text, sys.stdout)))
 
 
+def print_command(command: str) -> None:
+    """Print the next command, which can be copied: a line that does not fit the terminal is continued."""
+    print("next: " + " \\\n    ".join(fitted(command, sys.stdout, len("next:  \\"))))
+
+
 def wide_console() -> Console:
     """Return a console on stdout, as wide as the terminal, or 160 characters wide in a file."""
     from rich.console import Console

@@ -138,7 +138,7 @@ def test_a_map_with_harmonics_and_a_support_plane_is_planned_in_and_drawn(run: R
     assert covers["support_plane"]
     assert covers["map_gaussians"] == len(model)
     assert cv2.imread(str(tmp_path / "out" / "plan.png")) is not None
-    below = run(*words, "--goal-pose", 0.4, 0.3, -0.1, 0, 1, 0, 0)
+    below = run(*words, "--goal-pose", -0.45, 0.2, -0.05, 0, 1, 0, 0)
     assert below.code == 1
     assert "in the support plane of the scene.yaml at" in below.err
     assert run(*words, "--goal", *GOAL, "--no-support").code == 0
