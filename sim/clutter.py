@@ -77,7 +77,10 @@ def map_parts(model: GaussianModel, clutter: Clutter, base: Array) -> MapParts:
     T_scene_map = pose_at(clutter.at, clutter.rpy)
     R = T_scene_map[:3, :3]
     means = transform_points(T_scene_map, model.means.detach().double().numpy())
-    used = np.flatnonzero(solid_rows(model) & ((means >= clutter.low) & (means <= clutter.high)).all(axis=1))
+    inside = ((means >= clutter.low) & (means <= clutter.high)).all(axis=1)
+    for *center, radius in clutter.without:
+        inside &= np.linalg.norm(means - center, axis=1) > radius
+    used = np.flatnonzero(solid_rows(model) & inside)
     if not len(used):
         raise InputError(
             f"{clutter.file}: none of {len(means)} Gaussians is solid and between {clutter.low} and {clutter.high}.",

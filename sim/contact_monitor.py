@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
 
@@ -97,12 +98,18 @@ class ContactMonitor:
 
 
 class ClearanceMonitor:
-    """Minimum clearance between the arm's moving parts and other bodies, by bounding spheres and MuJoCo's distances."""
+    """Minimum clearance between the arm's moving parts and other bodies, by bounding spheres and MuJoCo's distances.
 
-    def __init__(self, world: World) -> None:
+    Args:
+        world: the scene.
+        without: names of parts of the arm that are left out, as a hand that has to come close.
+    """
+
+    def __init__(self, world: World, *, without: Collection[str] = ()) -> None:
         m = world.model
         moving = np.asarray(m.body_weldid)[np.asarray(m.geom_bodyid)] != 0
-        self._arm = np.flatnonzero(world.of_robot & moving)
+        counts = np.array([name not in without for name in world.owner], dtype=np.bool_)
+        self._arm = np.flatnonzero(world.of_robot & moving & counts)
         self._rest = np.flatnonzero(~world.of_robot)
         self._planes = np.asarray(m.geom_type)[self._rest] == int(mujoco.mjtGeom.mjGEOM_PLANE)
         excluded = set(world.mounted)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 
 from splatbot.errors import InputError
@@ -20,18 +23,25 @@ class TwinController(SteppedController):
         Args:
             twin: reset, or in any state.
             following: largest following error [rad or m], beyond which the controller faults.
+            watch: called with MuJoCo's data and the time [s] after every control period; must not change the data.
 
         Raises:
             InputError: the twin has no robot.
     """
 
-    def __init__(self, twin: Twin, *, following: float = CONTROLLER.max_tracking_error) -> None:
+    def __init__(
+        self,
+        twin: Twin,
+        *,
+        following: float = CONTROLLER.max_tracking_error,
+        watch: Callable[[Any, float], None] | None = None,
+    ) -> None:
         if twin.follower is None:
             raise InputError("has no robot.", field=twin.scene.name, hint="give the scene a robot")
         self.twin, self._follower = twin, twin.follower
         has_fingers = twin.world.robot is not None and twin.world.robot.gripper is not None
         self.gripper = TwinGripper(twin) if has_fingers else None
-        self._clock = 0.0
+        self._clock, self._watch = 0.0, watch
         super().__init__(self._measured(), period=1.0 / twin.rate, following=following)
         self._hold = self._position.copy()
 
@@ -68,6 +78,8 @@ class TwinController(SteppedController):
         opening = None if self.gripper is None else self.gripper.command(self._period)
         self.twin.advance(self._clock, q, velocity, acceleration, opening)
         self._clock += self._period
+        if self._watch is not None:
+            self._watch(self.twin.data, self._clock)
 
     def _measured(self) -> Array:
         return np.array(self.twin.data.qpos[self._follower.qpos])

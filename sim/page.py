@@ -42,11 +42,17 @@ CONSTANTS = TwinPageConstants()
 
 
 def twin_html(recording: TwinRecording, result: TwinResult) -> str:
+    """Return the page of a run of the twin; see :func:`recording_html`."""
+    return recording_html(recording, title=result.scene, facts=_facts(result))
+
+
+def recording_html(recording: TwinRecording, *, title: str, facts: str) -> str:
     """Return the page: robot, objects and map as points, contacts, and a curve of the arm's clearance over time.
 
     Args:
         recording: of the run.
-        result: of the run.
+        title: of the page.
+        facts: results of the run, one line.
     """
     world = recording.world
     own, tints, body, points, colors = _clouds(world)
@@ -68,7 +74,7 @@ def twin_html(recording: TwinRecording, result: TwinResult) -> str:
         "distance": 2.2,
         "size": CONSTANTS.point_size,
     }
-    return moving_page(result.scene, _facts(result), document, "twin_view.js", curve=True)
+    return moving_page(title, facts, document, "twin_view.js", curve=True)
 
 
 def _facts(result: TwinResult) -> str:

@@ -171,6 +171,11 @@ class Clutter(Section):
     )
     movable: bool = Field(default=False, description="whether fitted objects may be moved")
     objects: bool = Field(default=True, description="clusters above the table become primitives or hulls")
+    without: tuple[tuple[float, float, float, NotNegative], ...] = Field(
+        default=(),
+        description="balls (x, y, z, radius) in the robot's world [m] that the map leaves out, since an object of the "
+        "scene represents their content",
+    )
     harmonics: int = Field(default=0, ge=0, exclude=True, description="degree of its colours, set on loading")
 
 

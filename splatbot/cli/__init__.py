@@ -41,6 +41,9 @@ COMMANDS = {
     "export": _Command("splatbot.cli.export", "export", "Write a map as mesh, points, distance grid or occupancy."),
     "demo": _Command("splatbot.cli.demo", "demo", "Record, map, serve and query a synthetic tabletop."),
     "robot": _Command("splatbot.cli.robot", "robot", "Add a robot arm from a URDF, or describe a stored one."),
+    "plan-pick": _Command(
+        "splatbot.cli.plan_pick", "plan_pick", "Plan a complete pick in a map, and simulate it before the robot moves."
+    ),
     "pick": _Command("splatbot.cli.pick", "pick", "Pick a named object in the twin: scan, grasp, plan, lift, check."),
     "trials": _Command("splatbot.cli.trials", "trials", "Pick in many seeded scenes; report success and failures."),
     "gripper": _Command("splatbot.cli.gripper", "gripper", "Query or move a gripper, or a simulated one."),

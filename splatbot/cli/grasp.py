@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from splatbot.cli.paths import check_file, check_output
-from splatbot.cli.placing import Pose, base_pose, base_words, map_obstacles, margin_value, pose_values, run_folder
+from splatbot.cli.placing import Pose, base_pose, map_obstacles, margin_value, run_folder
 from splatbot.errors import InputError, SplatbotError
 from splatbot.layouts import map_file
 
@@ -116,10 +116,10 @@ def grasp(
     from splatbot.cli.tables import print_command
     from splatbot.grasping.advice import first_change
     from splatbot.grasping.affordance import find_target
+    from splatbot.grasping.grasp_file import grasp_file
     from splatbot.grasping.object_list import stroke_of
     from splatbot.grasping.options import GraspOptions
     from splatbot.grasping.spatial import SpatialAffordance
-    from splatbot.grasping.summary import summary
     from splatbot.grasping.tags import TagAffordance
     from splatbot.report.grasp_view import grasp_png
     from splatbot.robots.appearance import appearance
@@ -153,14 +153,8 @@ def grasp(
     folder = out if out is not None else Path("runs") / "grasp"
     folder.mkdir(parents=True, exist_ok=True)
     with atomic_write(folder / "grasp.json") as handle:
-        placed = {
-            "robot": arm.name,
-            "T_world_base": pose_values(scene.T_world_base),
-            "margin_m": sampler.margin,
-            "arm_margin_m": max(sampler.margin, sampler.arm_margin),
-            "unknown_space": unknown,
-        }
-        handle.write(json.dumps(summary(result) | placed, indent=2).encode())
+        content = grasp_file(result, sampler, map_file(map), robot=arm.name, unknown=unknown)
+        handle.write(json.dumps(content, indent=2).encode())
     shown = next(iter((*result.grasps, *result.doubtful)), result.best_rejected)
     if shown is not None:
         with atomic_write(folder / "grasp.png") as handle:
@@ -173,10 +167,7 @@ def grasp(
     result.unwrap()
     _print(result, folder, margin_text, verbose=verbose)
     if not hand_only:
-        on = f"--map {map} --robot {robot}{base_words(base)}"
-        on += "" if unknown == "free" else f" --unknown {unknown}"
-        on += "" if min_observations == 1 else f" --min-observations {min_observations}"
-        print_command(f"splatbot plan {on} --start home --grasp {folder / 'grasp.json'}")
+        print_command(f"splatbot plan-pick --map {map} --grasp {folder / 'grasp.json'} --start home")
     return 0
 
 

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from splatbot.gaussians import GaussianModel
     from splatbot.results.folder import RunFolder
     from splatbot.results.plan_obstacles import PlanObstacles
+    from splatbot.robots.robot import RobotModel
 
 Pose = tuple[float, float, float, float, float, float, float]
 
@@ -117,6 +118,29 @@ def map_obstacles(
     known = find_workspace(map_) if support else None
     plane = None if known is None else known.support_plane
     return PlanObstacles(field, model, arm, start, plane=plane, space=space, policy=unknown)
+
+
+def joint_values(words: tuple[str, ...], robot: RobotModel, flag: str) -> NDArray[np.float64]:
+    """Parse joint values (J,) [rad or m], or "home".
+
+    Raises:
+        InputError: they are no numbers, too few or too many, or degrees.
+    """
+    import numpy as np
+
+    from splatbot.errors import InputError
+    from splatbot.planning.goals import suspect_degrees
+
+    if words == ("home",):
+        return np.asarray(robot.home)
+    try:
+        values = np.array([float(word) for word in words])
+    except ValueError as error:
+        raise InputError(f"is {' '.join(words)}.", field=flag, hint='give numbers, or "home"') from error
+    if len(values) != len(robot) or not np.isfinite(values).all():
+        raise InputError(f"has {len(values)} values.", field=flag, hint=f"{robot.name} has {len(robot)} joints")
+    suspect_degrees(values, robot.chain, flag)
+    return values
 
 
 def margin_value(text: str) -> float:

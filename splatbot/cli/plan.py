@@ -14,6 +14,7 @@ from splatbot.cli.placing import (
     base_pose,
     base_words,
     checked_pose,
+    joint_values,
     map_obstacles,
     margin_value,
     pose_values,
@@ -73,8 +74,7 @@ def plan(
         start: joint values [rad or m], or "home".
         goal: joint values, or "home".
         goal_pose: pose of the tool instead of --goal, in the frame of the robot's base: position [m] and quaternion.
-        grasp: file of `splatbot grasp`; the goal is the pre-grasp. The approach from there is in that file, and is not
-            part of this plan.
+        grasp: file of `splatbot grasp`; the goal is the pre-grasp. See `splatbot plan-pick` for the whole pick.
         grasp_index: rank of the grasp in that file, from 0.
         robot: its name, as of `splatbot robot list`.
         base: pose of the robot's base in the map; by default that of the scene.yaml next to the map (see
@@ -111,6 +111,7 @@ def plan(
     from splatbot.cli.tables import print_command, print_text
     from splatbot.collision import GaussianCollisionField, RobotSpheres
     from splatbot.gaussians import GaussianModel
+    from splatbot.grasping.grasp_file import GraspFile
     from splatbot.planning import GaussianRRTStar, PoseGoal
     from splatbot.planning.closest import closest_approach
     from splatbot.report.plan_page import plan_html, plan_png
@@ -120,14 +121,16 @@ def plan(
     arm = load_robot(robot)
     model = GaussianModel.load(file)
     T_world_base = base_pose(base, map)
-    here = _joints(start, arm, "--start")
+    here = joint_values(start, arm, "--start")
     wanted: Any
     if goal_pose is not None:
         wanted = PoseGoal(T_world_base @ checked_pose(goal_pose, "--goal-pose"))
     elif grasp is not None:
-        wanted = _pregrasp(grasp, grasp_index, arm, T_world_base)
+        known = GraspFile.load(grasp)
+        known.check_robot(arm.name, T_world_base)
+        wanted = known.grasp(grasp_index, len(arm)).q_pregrasp
     else:
-        wanted = _joints(goal or (), arm, "--goal")
+        wanted = joint_values(goal or (), arm, "--goal")
     with steps() as tell:
         tell("loading the map")
         of_map = GaussianCollisionField(model, n_sigma, min_observations=min_observations)
@@ -172,9 +175,7 @@ def plan(
     replace_files(folder, writers | {"plan.png": write_bytes(picture)})
     _print(result, trajectory, covers, nearest, folder)
     if grasp is not None:
-        print_text(
-            f"the approach to the grasp is not part of this plan: approach_path of {grasp}, certified when found"
-        )
+        print_text("the approach to the grasp is not part of this plan; see `splatbot plan-pick` for the whole pick")
     of_plan = f"--map {map} --robot {robot}{base_words(base)} --trajectory {folder / 'trajectory.json'}"
     print_command(f"splatbot twin {of_plan}")
     return 0
@@ -204,55 +205,6 @@ def _plan(
         return plan_in_region(make_planner, plan_once, ends, error, confidence=confidence, speed=speed)
     tell("planning")
     return plan_at_margin(make_planner(margin_value(margin)), plan_once, speed=speed)
-
-
-def _pregrasp(path: Path, index: int, robot: RobotModel, T_world_base: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the joint values (J,) of the pre-grasp in a file of `splatbot grasp`.
-
-    Raises:
-        FormatError: the file is no such file.
-        InputError: its grasps are of another robot or another base, or it has no such grasp.
-    """
-    import numpy as np
-
-    from splatbot.errors import FormatError
-    from splatbot.geometry import pose_from_quat
-
-    try:
-        found = json.loads(path.read_text())
-        grasps, of = found["grasps"], found["robot"]
-        base = pose_from_quat(found["T_world_base"]["translation"], found["T_world_base"]["quaternion_wxyz"])
-        q = np.array([grasp["q_pregrasp"] or [] for grasp in grasps[index : index + 1]], dtype=np.float64)
-    except (ValueError, TypeError, KeyError, UnicodeDecodeError) as error:
-        hint = "give the grasp.json of `splatbot grasp`"
-        raise FormatError(f"is no file of grasps ({error!r}).", file=path, hint=hint) from error
-    if of != robot.name:
-        raise InputError(f"has grasps of {of}, not {robot.name}.", file=path, field="robot", hint=f"give --robot {of}")
-    if not np.allclose(base, T_world_base, rtol=0.0, atol=1e-6):
-        raise InputError("is another base.", file=path, field="T_world_base", hint="give the --base of the grasps")
-    if not 0 <= index < len(grasps):
-        hint = f"give 0 to {len(grasps) - 1}" if grasps else "search for grasps again"
-        raise InputError(f"is {index}, of {len(grasps)} grasps.", field="--grasp-index", hint=hint)
-    if q.shape != (1, len(robot)) or not np.isfinite(q).all():
-        raise InputError("has no joint values.", file=path, field="q_pregrasp", hint="search without --hand-only")
-    return np.asarray(q[0])
-
-
-def _joints(words: tuple[str, ...], robot: RobotModel, flag: str) -> NDArray[np.float64]:
-    import numpy as np
-
-    from splatbot.planning.goals import suspect_degrees
-
-    if words == ("home",):
-        return np.asarray(robot.home)
-    try:
-        values = np.array([float(word) for word in words])
-    except ValueError as error:
-        raise InputError(f"is {' '.join(words)}.", field=flag, hint='give numbers, or "home"') from error
-    if len(values) != len(robot) or not np.isfinite(values).all():
-        raise InputError(f"has {len(values)} values.", field=flag, hint=f"{robot.name} has {len(robot)} joints")
-    suspect_degrees(values, robot.chain, flag)
-    return values
 
 
 def _summary(

@@ -15,7 +15,7 @@ from splatbot.grasping.look import CONSTANTS as LOOK
 from splatbot.grasping.look import WristCamera, in_the_way, relocate, share_gone, unexplained
 from splatbot.grasping.moved_target import with_obstacles
 from splatbot.grasping.pick_planner import MapPickPlanner, PickPlan, PickPlanner, Segment
-from splatbot.grasping.pick_types import PickOptions, PickOutcome, PickResult, PickStage, PickStep
+from splatbot.grasping.pick_types import PickMotion, PickOptions, PickOutcome, PickResult, PickStage, PickStep
 from splatbot.grasping.sampler import GraspSampler
 from splatbot.grasping.types import Grasp, GraspResult, NoGraspError
 from splatbot.planning import JointGoal, certify_motion, time_path
@@ -67,6 +67,7 @@ class Picker:
 
     Raises:
         InputError: a wrist camera and another planner are given, because only that of the map follows a moved target.
+        InputError: a wrist camera is given and the sampler agrees with plans, whose obstacles do not follow the target.
         InputError: the stroke of the gripper is smaller than that of the robot's hand model.
     """
 
@@ -85,6 +86,9 @@ class Picker:
         if camera is not None and make_planner is not None:
             hint = "leave make_planner out"
             raise InputError("needs the planner of the map.", field="camera", hint=hint)
+        if camera is not None and sampler.departure is not None:
+            hint = "leave the camera out, or do not call agree_with_plans"
+            raise InputError("has obstacles of plans, which do not follow a target.", field="sampler", hint=hint)
         if gripper.stroke < sampler.hand.stroke - 1e-6:
             text = f"opens {gripper.stroke:g} m, the hand of the robot {sampler.hand.stroke:g} m."
             raise InputError(text, field="gripper", hint="give the robot that has this gripper")
@@ -120,6 +124,7 @@ class _Pick:
         self.q: Array | None = None
         self.planning_seconds: float | None = None
         self.notes: list[str] = []
+        self.motions: list[PickMotion] = []
         self.left: list[tuple[int, Grasp]] = []
         self.T_now_mapped = np.eye(4)
         self.attempts, self.shift = 0, None if picker.camera is None else 0.0
@@ -311,6 +316,9 @@ class _Pick:
         if not trajectory.certificate.certified:
             raise _EndedError(PickOutcome.NO_PLAN, "the timed trajectory is not certified as free")
         motion = certify_motion(trajectory, segment.arm, segment.around)
+        for guard in segment.guards:
+            certify_motion(trajectory, guard.links, guard.field)
+        self.motions.append(PickMotion(stage, trajectory, self.gripper.opening()))
         done = follow(self.controller, motion, stop=self._stop_requested)
         self.q = trajectory.end
         if done.state is MotionState.STOPPED and self._stop_requested(None):
@@ -353,7 +361,7 @@ class _Pick:
     def _result(self, outcome: PickOutcome, reason: str, error: SplatbotError | None = None) -> PickResult:
         return PickResult(
             outcome, self.stage, reason, self.grasp, tuple(self.steps), self.opening, self.attached, self.q, error,
-            self.planning_seconds, tuple(self.notes), self.attempts, self.shift,
+            self.planning_seconds, tuple(self.notes), self.attempts, self.shift, tuple(self.motions),
         )  # fmt: skip
 
 

@@ -11,6 +11,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from splatbot.collision import GaussianCollisionField, RobotSpheres
+from splatbot.errors import InputError
 from splatbot.geometry import inverse, transform_points
 from splatbot.grasping.affordance import Target
 from splatbot.grasping.attached import covering_spheres
@@ -18,6 +19,7 @@ from splatbot.grasping.hands import CONSTANTS as HANDS
 from splatbot.grasping.moved_target import moved_grasp, moved_sampler
 from splatbot.grasping.obstacles import around_target
 from splatbot.grasping.pick_types import PickOptions
+from splatbot.grasping.reach import LinkGuard, link_guards
 from splatbot.grasping.sampler import GraspSampler
 from splatbot.grasping.types import Grasp
 from splatbot.planning import GaussianRRTStar, JointGoal, Path, PoseGoal
@@ -52,12 +54,14 @@ class Segment:
         around: field against which rounded corners of the path are certified. If None, the planner checks collisions
             by other means and the corners are not certified.
         avoids_moving: whether the path avoids the regions where motion was observed; True without such regions.
+        guards: further obstacles, against which the executed curve is certified too.
     """
 
     path: Path
     arm: RobotSpheres
     around: GaussianCollisionField | None
     avoids_moving: bool = True
+    guards: tuple[LinkGuard, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,13 +135,23 @@ class MapPickPlanner:
     Regions where motion was observed during mapping are additional obstacles of plans with ``avoid_moving``. The
     certificates of such plans cover both.
 
+    If the sampler agrees with plans (:meth:`splatbot.grasping.sampler.GraspSampler.agree_with_plans`), the way to the
+    pre-grasp avoids the obstacles of plans with the margin of the arm. The links before the hand keep that margin on
+    approach and lift too.
+
     Args:
         sampler: grasp sampler with the map, the robot and its base pose.
         target: the target to pick.
         options: options of the pick.
+
+    Raises:
+        InputError: the sampler has regions of motion and agrees with plans, whose obstacles do not include them.
     """
 
     def __init__(self, sampler: GraspSampler, target: Target, options: PickOptions) -> None:
+        if sampler.departure is not None and sampler.moving is not None:
+            hint = "leave `moving` out, or do not call agree_with_plans"
+            raise InputError("has regions of motion and agrees with plans.", field="sampler", hint=hint)
         self.s, self.o = sampler, options
         self._T = sampler.scene.T_world_base
         self._object = target_spheres(sampler, target)
@@ -146,7 +160,8 @@ class MapPickPlanner:
         inside = within(around.means.detach().double().numpy(), self._object)
         around_held = around.select(torch.from_numpy(~inside))
         field = sampler.collision_field
-        self._static = _Obstacles(sampler.field, field(around), field(around_held))
+        whole = sampler.field if sampler.departure is None else sampler.departure
+        self._static = _Obstacles(whole, field(around), field(around_held))
         self._avoiding_moving: _Obstacles | None = None
         if sampler.moving is not None:
             models = (sampler.scene.model, around, around_held)
@@ -166,7 +181,8 @@ class MapPickPlanner:
         planning_seconds = time.perf_counter() - begin
         if plan.path is None:
             return plan.reason.rstrip(".")
-        approach = straight_line(planner.arm, obstacles.around, grasp.q_pregrasp, grasp.T_world_tcp)
+        hand = self._arm(opening)
+        approach = straight_line(hand, obstacles.around, grasp.q_pregrasp, grasp.T_world_tcp)
         if not approach or approach.path is None:
             return f"its approach is blocked: {approach.reason.rstrip('.')}"
         q = approach.path.waypoints[-1]
@@ -179,16 +195,21 @@ class MapPickPlanner:
         lift = self._up(loaded, obstacles.around_held, lift_off.path.waypoints[-1], self.o.lift - self.o.lift_off)
         if not lift or lift.path is None:
             return f"it cannot be lifted: {lift.reason.rstrip('.')}"
-        return PickPlan(
-            grasp,
-            opening,
-            attached,
-            Segment(plan.path, planner.arm, obstacles.whole, avoids_moving),
-            Segment(approach.path, planner.arm, obstacles.around, avoids_moving),
-            Segment(lift_off.path, closed, obstacles.around_held, avoids_moving),
-            Segment(lift.path, loaded, obstacles.around_held, avoids_moving),
-            planning_seconds,
-        )
+        to_pregrasp = Segment(plan.path, planner.arm, obstacles.whole, avoids_moving)
+        straight = [
+            Segment(path, arm, field, avoids_moving, self._guards(field))
+            for path, arm, field in (
+                (approach.path, hand, obstacles.around),
+                (lift_off.path, closed, obstacles.around_held),
+                (lift.path, loaded, obstacles.around_held),
+            )
+        ]
+        for segment in straight:
+            for guard in segment.guards:
+                if guard.meets(segment.path.waypoints):
+                    return guard.reason
+        approach_, lift_off_, lift_ = straight
+        return PickPlan(grasp, opening, attached, to_pregrasp, approach_, lift_off_, lift_, planning_seconds)
 
     def plan_carry(self, plan: PickPlan, start: Array, goal: JointGoal) -> Segment | str:
         """Plan a path with the attached object, if possible around the regions where motion was observed."""
@@ -241,14 +262,21 @@ class MapPickPlanner:
     def _planner(
         self, field: GaussianCollisionField, opening: float, attached: ArrayLike | None = None
     ) -> GaussianRRTStar:
+        margin = self.s.margin if self.s.departure is None else max(self.s.margin, self.s.arm_margin)
         return GaussianRRTStar(
-            field, self.s.robot, T_world_base=self._T, opening=opening, attached=attached, margin=self.s.margin
+            field, self.s.robot, T_world_base=self._T, opening=opening, attached=attached, margin=margin
         )
 
     def _arm(self, opening: float, attached: ArrayLike | None = None) -> RobotSpheres:
         return RobotSpheres(
             self.s.robot, T_world_base=self._T, opening=opening, attached=attached, margin=self.s.margin
         )
+
+    def _guards(self, field: GaussianCollisionField) -> tuple[LinkGuard, ...]:
+        if self.s.departure is None:
+            return ()
+        margins = {"margin": self.s.margin, "arm_margin": self.s.arm_margin}
+        return link_guards(self.s.robot, self._T, field, unknown=self.s.unknown, **margins)
 
     def _up(self, arm: RobotSpheres, field: GaussianCollisionField, q: Array, height: float) -> StraightResult:
         return straight_line(arm, field, q, raised(self.s, arm, q, height))

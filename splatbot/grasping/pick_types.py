@@ -8,6 +8,7 @@ from enum import StrEnum
 from splatbot.errors import InputError, SplatbotError
 from splatbot.grasping.options import GraspOptions
 from splatbot.grasping.types import Grasp
+from splatbot.planning import JointTrajectory
 from splatbot.protocols import Array
 
 
@@ -111,6 +112,21 @@ class PickStep:
 
 
 @dataclass(frozen=True, eq=False)
+class PickMotion:
+    """A motion of the arm that a pick executed.
+
+    Args:
+        stage: its stage.
+        trajectory: the certified trajectory.
+        opening: finger opening during it [m].
+    """
+
+    stage: PickStage
+    trajectory: JointTrajectory
+    opening: float
+
+
+@dataclass(frozen=True, eq=False)
 class PickResult:
     """Result of a pick; its truth value is True if the object is held.
 
@@ -129,6 +145,7 @@ class PickResult:
         attempts: number of grasps that were executed.
         shift: distance by which the last look found the target moved [m]. If None, there was no look.
         notes: remarks on the executed plan, each a sentence.
+        motions: motions of the arm that were sent to the controller, in order.
     """
 
     outcome: PickOutcome
@@ -144,6 +161,7 @@ class PickResult:
     notes: tuple[str, ...] = ()
     attempts: int = 0
     shift: float | None = None
+    motions: tuple[PickMotion, ...] = ()
 
     def __bool__(self) -> bool:
         return self.outcome is PickOutcome.PICKED

@@ -55,6 +55,52 @@ class Reached:
     kind: str = ""
 
 
+@dataclass(frozen=True, eq=False)
+class LinkGuard:
+    """Obstacles from which the links before the hand keep more distance than the hand does.
+
+    Args:
+        links: the links, with the margin that they keep.
+        field: the obstacles.
+        obstacle: their name.
+        kind: category of the reason if a path is nearer; see :class:`Reached`.
+    """
+
+    links: RobotSpheres
+    field: GaussianCollisionField
+    obstacle: str
+    kind: str
+
+    def meets(self, path: Array) -> bool:
+        """Return whether a link comes within the margin of an obstacle on a path (K, J)."""
+        return bool(self.links.certify(self.field, path[:-1], path[1:]).in_collision.any())
+
+    @property
+    def reason(self) -> str:
+        """One clause that describes a path on which a link comes too near."""
+        return f"the arm comes within {1e3 * self.links.margin:.1f} mm of {self.obstacle} on its approach"
+
+
+def link_guards(
+    robot: RobotKinematics,
+    T_world_base: Array,
+    around: GaussianCollisionField,
+    *,
+    margin: float,
+    arm_margin: float,
+    unknown: GaussianCollisionField | None,
+) -> tuple[LinkGuard, ...]:
+    """Return the guards of the links before the hand on the way to a grasp; for arguments see :class:`ArmReach`."""
+    most = max(margin, arm_margin)
+    links = RobotSpheres(robot, T_world_base=T_world_base, margin=most).without_hand(most)
+    found = []
+    if arm_margin > margin:
+        found.append(LinkGuard(links, around, "the map", "bring the arm within the margin of the map"))
+    if unknown is not None:
+        found.append(LinkGuard(links, unknown, "unknown space", "bring the arm into unknown space"))
+    return tuple(found)
+
+
 class ReachabilityCheck(Protocol):
     """Checks whether an arm reaches a grasp."""
 
@@ -123,17 +169,8 @@ class ArmReach:
             return RobotSpheres(robot, T_world_base=T_world_base, opening=width, margin=margin)
 
         self._arm = arm
-        most = max(margin, arm_margin)
-        self._open = RobotSpheres(robot, T_world_base=T_world_base, margin=most)
-        links = self._open.without_hand(most)
-        self._links = [
-            (links, field, what, kind)
-            for field, what, kind in (
-                (around if arm_margin > margin else None, "the map", "bring the arm within the margin of the map"),
-                (unknown, "unknown space", "bring the arm into unknown space"),
-            )
-            if field is not None
-        ]
+        self._open = RobotSpheres(robot, T_world_base=T_world_base, margin=max(margin, arm_margin))
+        self._guards = link_guards(robot, T_world_base, around, margin=margin, arm_margin=arm_margin, unknown=unknown)
 
     def arm(self, opening: float) -> RobotSpheres:
         """Return the arm's spheres with the fingers opened to ``opening`` [m], rounded up to 2 mm."""
@@ -167,9 +204,9 @@ class ArmReach:
                 reason, kind = "no plan may end at its pre-grasp", "start where no plan may end"
                 continue
             way = back.path.waypoints
-            near = next((each for each in self._links if _meets(*each[:2], way)), None)
+            near = next((guard for guard in self._guards if guard.meets(way)), None)
             if near is not None:
-                reason, kind = f"the arm comes within {_mm(near[0].margin)} of {near[2]} on its approach", near[3]
+                reason, kind = near.reason, near.kind
                 continue
             clearance = float(back.path.certificate.clearance)
             return Reached(q, back.path.waypoints[::-1].copy(), clearance, self._limits(q))
@@ -179,11 +216,3 @@ class ArmReach:
         chain = self.robot.chain
         half = (chain.upper - chain.lower) / 2
         return float((np.minimum(q - chain.lower, chain.upper - q) / half).min())
-
-
-def _meets(arm: RobotSpheres, field: GaussianCollisionField, way: Array) -> bool:
-    return bool(arm.certify(field, way[:-1], way[1:]).in_collision.any())
-
-
-def _mm(length: float) -> str:
-    return f"{1e3 * length:.1f} mm"

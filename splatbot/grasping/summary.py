@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from splatbot.geometry import rotation_to_quat
+from splatbot.geometry import pose_from_quat, rotation_to_quat
 from splatbot.grasping.types import Grasp, GraspResult
 from splatbot.protocols import Array
 
@@ -56,6 +57,49 @@ def _grasp_summary(grasp: Grasp) -> dict[str, Any]:
         "approach_path": grasp.approach_path.tolist() if grasp.approach_path is not None else None,
         "rejected": grasp.rejected,
     }
+
+
+def grasp_from(values: Mapping[str, Any]) -> Grasp:
+    """Return the grasp that :func:`summary` wrote as JSON values.
+
+    Raises:
+        KeyError, TypeError, ValueError: the values are of something else.
+    """
+
+    def pose(name: str) -> Array:
+        return pose_from_quat(values[name]["position"], values[name]["quaternion_wxyz"])
+
+    def array(name: str, *shape: int) -> Array | None:
+        if values[name] is None:
+            return None
+        found = np.array([np.inf if x is None else x for x in values[name]], dtype=np.float64)
+        if found.ndim != len(shape) or any(n not in (-1, k) for n, k in zip(shape, found.shape, strict=True)):
+            raise ValueError(f"{name} has the shape {found.shape}")
+        return found
+
+    contacts, normals = array("contacts", 2, 3), array("normals", 2, 3)
+    if contacts is None or normals is None:
+        raise ValueError("contacts or normals are null")
+    q = array("q", -1)
+    joints = -1 if q is None else len(q)
+    return Grasp(
+        T_world_tcp=pose("T_world_tcp"),
+        width=float(values["width_m"]),
+        opening=float(values["opening_m"]),
+        contacts=contacts,
+        normals=normals,
+        approach=str(values["approach"]),
+        terms={str(name): float(term) for name, term in values["terms"].items()},
+        total=float(values["total"]),
+        clearance=float(values["clearance_m"]),
+        T_world_pregrasp=pose("T_world_pregrasp"),
+        q=q,
+        q_pregrasp=array("q_pregrasp", joints),
+        approach_path=array("approach_path", -1, joints),
+        rejected=str(values["rejected"]),
+        depth_distance=array("contact_depth_distance_m", 2),
+        unseen=array("finger_unseen", 2),
+    )
 
 
 def _finite(values: Array | None) -> list[float | None] | None:

@@ -18,6 +18,7 @@ from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.robots.panda import panda
 from splatbot.workspace import Workspace
 from tests.unit.cli.conftest import RunCommand, assert_refused
+from tests.unit.grasping.files import STANDING, grasp_file_values, grasp_values
 
 BASE = ("--base", 0, 0, 0, 1, 0, 0, 0)
 UPRIGHT = (0.0, 0.0, 0.0, -0.5, 0.0, 0.5, 0.8)
@@ -31,17 +32,9 @@ def map_file(tmp_path: Path) -> Path:
     return path
 
 
-STANDING = {"translation": [0, 0, 0], "quaternion_wxyz": [1, 0, 0, 0]}
-
-
-def grasps_file(path: Path, *poses: tuple[float, ...] | None, robot: str = "panda") -> Path:
-    grasps = [{"q_pregrasp": None if q is None else list(q)} for q in poses]
-    path.write_text(json.dumps({"robot": robot, "T_world_base": STANDING, "grasps": grasps}))
-    return path
-
-
 def test_the_pregrasp_of_a_grasp_is_a_goal(run: RunCommand, map_file: Path, tmp_path: Path) -> None:
-    file = grasps_file(tmp_path / "grasp.json", UPRIGHT, GOAL)
+    file = tmp_path / "grasp.json"
+    file.write_text(json.dumps(grasp_file_values(grasp_values(UPRIGHT), grasp_values(GOAL))))
     out = tmp_path / "out"
     words = ("plan", "--map", map_file, *BASE, "--start", "home", "--grasp", file, "--grasp-index", 1)
     answer = run(*words, "--out", out)
@@ -57,9 +50,12 @@ def test_the_pregrasp_of_a_grasp_is_a_goal(run: RunCommand, map_file: Path, tmp_
         ({"grasps": [{}]}, 0, "is no file of grasps"),
         ({"T_world_base": {"translation": [0, 0]}}, 0, "is no file of grasps"),
         ({"grasps": []}, 0, "--grasp-index: is 0, of 0 grasps"),
-        ({"grasps": [{"q_pregrasp": [0]}]}, 0, "has no joint values"),
-        ({"grasps": [{"q_pregrasp": None}]}, 0, "has no joint values"),
-        ({"grasps": [{"q_pregrasp": [0, 0, 0, float("nan"), 0, 0, 0]}]}, 0, "has no joint values"),
+        ({"grasps": [grasp_values((0.0,))]}, 0, "has no joint values"),
+        ({"grasps": [grasp_values(None)]}, 0, "has no joint values"),
+        ({"grasps": [grasp_values((0, 0, 0, float("nan"), 0, 0, 0))]}, 0, "has no joint values"),
+        ({"grasps": [grasp_values(GOAL) | {"contacts": [[0, 0, 0]]}]}, 0, "is no file of grasps"),
+        ({"grasps": [grasp_values(GOAL) | {"approach_path": [[0, 0]]}]}, 0, "is no file of grasps"),
+        ({"unknown_space": "maybe"}, 0, "is no file of grasps"),
         ({}, -1, "--grasp-index: is -1"),
         ({"robot": "ur5e-2f85"}, 0, "give --robot ur5e-2f85"),
         ({"T_world_base": STANDING | {"translation": [0, 0, 0.01]}}, 0, "give the --base of the grasps"),
@@ -69,8 +65,7 @@ def test_files_of_grasps_that_give_no_goal_are_refused(
     run: RunCommand, map_file: Path, tmp_path: Path, changes: dict[str, Any], index: int, why: str
 ) -> None:
     file = tmp_path / "grasp.json"
-    good = {"robot": "panda", "T_world_base": STANDING, "grasps": [{"q_pregrasp": list(GOAL)}]}
-    file.write_text(json.dumps(good | changes))
+    file.write_text(json.dumps(grasp_file_values(grasp_values(GOAL)) | changes))
     words = ("plan", "--map", map_file, *BASE, "--start", "home", "--out", tmp_path / "out")
     assert_refused(run(*words, "--grasp", file, "--grasp-index", index), why)
     assert not (tmp_path / "out").exists()

@@ -1,0 +1,266 @@
+"""`splatbot plan-pick`."""
+
+from __future__ import annotations
+
+import json
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from splatbot.cli.drawing import draw_offscreen
+from splatbot.cli.grasp import graspable_objects
+from splatbot.cli.paths import check_file, check_output
+from splatbot.cli.placing import Pose, joint_values, map_obstacles, pose_values
+from splatbot.errors import SplatbotError
+from splatbot.layouts import map_file
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from splatbot.grasping.grasp_file import GraspFile
+    from splatbot.grasping.sampler import GraspSampler
+    from splatbot.robots.robot import RobotModel
+    from splatbot.sim.map_pick import MapPick
+
+
+def plan_pick(
+    *,
+    map: Annotated[Path, tyro.conf.arg(metavar="MAP")],
+    grasp: Annotated[Path, tyro.conf.arg(metavar="JSON")],
+    start: Annotated[tuple[str, ...], tyro.conf.arg(metavar="Q ...")] = ("home",),
+    grasp_index: int | None = None,
+    lift: float = 0.15,
+    speed: float = 0.2,
+    slow: float = 0.3,
+    force: Annotated[float | None, tyro.conf.arg(metavar="NEWTONS")] = None,
+    tries: int = 5,
+    budget_ms: float = 500.0,
+    video: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
+    seed: int = 0,
+    out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
+) -> int:
+    """Plan a complete pick in a map, and simulate it in the twin of the map before the robot moves.
+
+    The pick is: open, move to the pre-grasp, approach in a straight line, close, lift. Each motion is certified as it
+    will be executed, with the fingers at their opening and the object in the hand. The twin then executes the pick with
+    contacts and friction. The exit code is 1 unless the object is held and nothing else was touched.
+
+    Writes one JointTrajectory for each motion (1-move.json, 2-approach.json and so on). pick.json has their order and
+    the finger openings; pick.html animates the simulation.
+
+    Examples:
+        splatbot plan-pick --map runs/latest --grasp runs/grasp/grasp.json
+        splatbot plan-pick --map runs/latest --grasp runs/grasp/grasp.json --grasp-index 2 --speed 0.1 --video pick.mp4
+
+    Args:
+        map: a run folder, or a map file.
+        grasp: file of `splatbot grasp`; its robot, base, margins and treatment of unknown space apply.
+        start: joint values [rad or m], or "home".
+        grasp_index: rank of the grasp in that file, from 0; by default the first that can be planned.
+        lift: height of the lift [m].
+        speed: fraction of the limits of velocity and acceleration.
+        slow: additional factor on the speed of approach and lift.
+        force: force of the fingers; by default the gripper's own.
+        tries: largest number of grasps to plan for.
+        budget_ms: time budget of the planner for the way to each pre-grasp [ms].
+        video: MP4 of the simulation.
+        seed: seed of the planner, and of small displacements of the object in the twin; 0 for none.
+        out: folder to write to; by default runs/pick.
+    """
+    file = map_file(map)
+    check_file(grasp, "--grasp")
+    check_output(out)
+    check_output(video, "--video", folder=False)
+    if video is not None:
+        draw_offscreen()
+
+    from splatbot.atomic import replace_files, write_text
+    from splatbot.cli.progress import steps
+    from splatbot.grasping.grasp_file import GraspFile
+    from splatbot.grasping.pick_types import PickOptions
+    from splatbot.robots.store import load_robot
+    from splatbot.sim.map_pick import pick_on_map
+    from splatbot.sim.page import recording_html
+
+    options = PickOptions(
+        lift=lift, speed=speed, slow=slow, force=force, tries=tries, budget_ms=budget_ms, attempts=1, seed=seed
+    )
+    known = GraspFile.load(grasp)
+    robot = load_robot(known.robot)
+    grasps = known.result(grasp_index, len(robot))
+    here = joint_values(start, robot, "--start")
+    with steps() as tell, _interrupted() as stop:
+        tell("segmenting the objects of the map")
+        objects = graspable_objects(map, _base(map, known))
+        known.check_map(file, len(objects.scene.model))
+        sampler = objects.sampler(robot, n_sigma=known.n_sigma, min_observations=known.min_observations)
+        sampler.margin, sampler.arm_margin = known.margin, known.arm_margin
+        tell("collecting the obstacles of plans")
+        _agree_with_plans(sampler, map, robot, known, here)
+        tell("planning and simulating the pick")
+        with _film(video) as watch:
+            picked = pick_on_map(
+                _scene(map, known, with_camera=video is not None), robot, sampler, known.target, grasps,
+                options, start=here, seed=seed, stop=stop, on_step=lambda step: tell(f"{step.stage}: {step.note}"),
+                watch=watch,
+            )  # fmt: skip
+    folder = out if out is not None else Path("runs") / "pick"
+    texts = {"pick.json": json.dumps(_summary(picked, known), indent=2)}
+    for name, motion in zip(_names(picked), picked.result.motions, strict=True):
+        texts[name] = motion.trajectory.to_json()
+    title = f"{known.target.label} in {map.resolve().name}"
+    texts["pick.html"] = recording_html(picked.recording, title=title, facts=f"simulated: {_verdict(picked)}")
+    replace_files(folder, {name: write_text(text) for name, text in texts.items()})
+    _print(picked, known, folder)
+    if not picked:
+        raise SplatbotError(f"should not be executed: {picked.problems[0]}.", field="pick", hint=_HINT)
+    return 0
+
+
+_HINT = "try another grasp (`--grasp-index`), or map the scene from more sides"
+
+
+def _base(map_: Path, known: GraspFile) -> Pose | None:
+    """Return the base of the grasps as a flag's value, or None if it is that of the scene.yaml."""
+    import numpy as np
+
+    from splatbot.workspace import find_workspace
+
+    workspace = find_workspace(map_)
+    placed = None if workspace is None else workspace.T_world_base
+    if placed is not None and np.allclose(placed, known.T_world_base, rtol=0.0, atol=1e-6):
+        return None
+    pose = pose_values(known.T_world_base)
+    x, y, z = pose["translation"]
+    return (x, y, z, *pose["quaternion_wxyz"])  # type: ignore[return-value]
+
+
+def _agree_with_plans(
+    sampler: GraspSampler, map_: Path, robot: RobotModel, known: GraspFile, start: NDArray[np.float64]
+) -> None:
+    """Set the obstacles of plans that begin at ``start`` (J,); see :func:`splatbot.cli.placing.map_obstacles`."""
+    from splatbot.collision import GaussianCollisionField, RobotSpheres
+    from splatbot.gaussians import GaussianModel
+
+    model, most = GaussianModel.load(map_file(map_)), max(sampler.margin, sampler.arm_margin)
+    field = GaussianCollisionField(model, min_observations=sampler.min_observations)
+    spheres = RobotSpheres(robot, T_world_base=sampler.scene.T_world_base)
+    around = map_obstacles(map_, field, model, spheres, start, unknown=known.unknown)
+    sampler.agree_with_plans(around.field(most), around.unknown_field(most))
+
+
+def _scene(map_: Path, known: GraspFile, *, with_camera: bool) -> Any:
+    from splatbot.sim.maps.placed import placed_scene
+    from splatbot.sim.scene import make_scene
+
+    values = placed_scene(map_, T_world_base=known.T_world_base)
+    if with_camera:
+        values["camera"] = {"at": [1.5, -0.9, 0.9], "look_at": [0.35, 0.0, 0.25], "width": 640, "height": 480}
+    return make_scene(values)
+
+
+@contextmanager
+def _film(path: Path | None) -> Iterator[Callable[[Any], Any] | None]:
+    if path is None:
+        yield None
+        return
+    from splatbot.sim.camera import TwinCamera
+    from splatbot.sim.dressing import dressed
+    from splatbot.sim.video import Video
+
+    with ExitStack() as stack:
+
+        def watch(world: Any) -> Video:
+            video = Video(path, TwinCamera(dressed(world)))
+            stack.callback(video.close)
+            return video
+
+        yield watch
+
+
+@contextmanager
+def _interrupted() -> Iterator[Callable[[], bool]]:
+    """Yield a function that returns whether Ctrl-C was pressed; the second one ends the process."""
+    pressed: list[int] = []
+
+    def press(number: int, frame: Any) -> None:
+        pressed.append(number)
+        signal.signal(signal.SIGINT, before)
+
+    before = signal.signal(signal.SIGINT, press)
+    try:
+        yield lambda: bool(pressed)
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _names(picked: MapPick) -> list[str]:
+    return [f"{number}-{motion.stage}.json" for number, motion in enumerate(picked.result.motions, start=1)]
+
+
+def _summary(picked: MapPick, known: GraspFile) -> dict[str, Any]:
+    from dataclasses import asdict
+
+    result = picked.result
+    return {
+        "robot": known.robot,
+        "T_world_base": pose_values(known.T_world_base),
+        "target": known.target.label,
+        "execute": bool(picked),
+        "problems": list(picked.problems),
+        "motions": [
+            {
+                "stage": motion.stage,
+                "file": name,
+                "duration_s": motion.trajectory.duration,
+                "opening_m": motion.opening,
+                "certified": motion.trajectory.certificate.certified,
+                "clearance_m": motion.trajectory.certificate.clearance,
+                "margin_m": motion.trajectory.certificate.margin,
+            }
+            for name, motion in zip(_names(picked), result.motions, strict=True)
+        ],
+        "stages": [{"stage": step.stage, "note": step.note} for step in result.steps],
+        "arm_margin_m": known.arm_margin,
+        "grasp_width_m": None if result.grasp is None else result.grasp.width,
+        "simulated": {
+            "outcome": result.outcome,
+            "reason": result.reason,
+            "rose_m": picked.rose,
+            "contacts": [asdict(contact) for contact in picked.contacts],
+            "clearance": asdict(picked.clearance),
+            "notes": list(picked.notes),
+        },
+    }
+
+
+def _verdict(picked: MapPick) -> str:
+    if picked:
+        return f"held, and risen by {1e3 * picked.rose:.0f} mm; the arm touched nothing else"
+    return "; ".join(picked.problems)
+
+
+def _print(picked: MapPick, known: GraspFile, folder: Path) -> None:
+    from splatbot.cli.tables import print_table, print_text
+    from splatbot.planning.timing import clearance_text
+
+    result, near = picked.result, picked.clearance
+    rows = [(str(step.stage), step.note) for step in result.steps]
+    for name, motion in zip(_names(picked), result.motions, strict=True):
+        length, opening = f"{motion.trajectory.duration:.1f} s", f"{1e3 * motion.opening:.0f} mm open"
+        clearance = clearance_text(motion.trajectory.certificate)
+        rows.append((name.removesuffix(".json"), f"{length}, {opening}, clearance {clearance}"))
+    rows.append(("margin", f"{1e3 * known.arm_margin:.1f} mm before the hand, {1e3 * known.margin:.1f} mm at the hand"))
+    rows.append(("simulated", _verdict(picked)))
+    if near.part:
+        where = f"{near.part} and {near.other} at {near.time:.1f} s"
+        rows.append(("nearest in the twin", f"{1e3 * near.value:.1f} mm, {where}; without the hand"))
+    print_table([*rows, ("written to", str(folder))], title=f"pick of {known.target.label}")
+    print_text(
+        "the twin assumes a mass of 0.2 kg and the friction of its table; the shape of the target is the completed one"
+    )

@@ -1,0 +1,167 @@
+"""Files of grasps, which `splatbot grasp` writes and plans and picks read."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from splatbot.collision.unknown import UnknownPolicy
+from splatbot.errors import FormatError, InputError
+from splatbot.geometry import pose_from_quat, rotation_to_quat
+from splatbot.grasping.affordance import Target
+from splatbot.grasping.sampler import GraspSampler
+from splatbot.grasping.summary import grasp_from, summary
+from splatbot.grasping.types import Grasp, GraspResult
+from splatbot.protocols import Array
+
+_HINT = "give the grasp.json of `splatbot grasp`"
+
+
+@dataclass(frozen=True, eq=False)
+class GraspFile:
+    """Content of a file of grasps.
+
+    Args:
+        path: the file.
+        robot: name of the robot.
+        T_world_base: (4, 4) pose of its base [m].
+        target: the target; its rows are those of the map without flying pixels.
+        grasps: grasps, best first.
+        margin, arm_margin: clearance [m] of the whole arm, and of the links before the hand.
+        unknown: treatment of unknown space.
+        n_sigma: surface of a Gaussian, in standard deviations.
+        min_observations: least number of keyframes that support a Gaussian.
+        map_sha256: hash of the map's file.
+    """
+
+    path: Path
+    robot: str
+    T_world_base: Array
+    target: Target
+    grasps: tuple[Grasp, ...]
+    margin: float
+    arm_margin: float
+    unknown: UnknownPolicy
+    n_sigma: float
+    min_observations: int
+    map_sha256: str
+
+    @classmethod
+    def load(cls, path: Path) -> GraspFile:
+        """Read a file.
+
+        Raises:
+            FormatError: the file is no such file.
+        """
+        try:
+            return cls._from(path, json.loads(path.read_text()))
+        except (ValueError, TypeError, KeyError, UnicodeDecodeError) as error:
+            raise FormatError(f"is no file of grasps ({error!r}).", file=path, hint=_HINT) from error
+
+    @classmethod
+    def _from(cls, path: Path, values: Mapping[str, Any]) -> GraspFile:
+        base, target = values["T_world_base"], values["target"]
+        if values["unknown_space"] not in ("free", "cautious", "occupied"):
+            raise ValueError(f"unknown_space is {values['unknown_space']!r}")
+        return cls(
+            path=path,
+            robot=str(values["robot"]),
+            T_world_base=pose_from_quat(base["translation"], base["quaternion_wxyz"]),
+            target=Target(
+                np.array(values["target_rows"], dtype=np.int64),
+                None,
+                str(target["label"]),
+                str(target["backend"]),
+                float(target["score"]),
+            ),
+            grasps=tuple(grasp_from(grasp) for grasp in values["grasps"]),
+            margin=float(values["margin_m"]),
+            arm_margin=float(values["arm_margin_m"]),
+            unknown=values["unknown_space"],
+            n_sigma=float(values["n_sigma"]),
+            min_observations=int(values["min_observations"]),
+            map_sha256=str(values["map_sha256"]),
+        )
+
+    def check_robot(self, name: str, T_world_base: Array) -> None:
+        """Check that the grasps are of a robot at a base (4, 4).
+
+        Raises:
+            InputError: they are of another robot or another base.
+        """
+        if self.robot != name:
+            hint = f"give --robot {self.robot}"
+            raise InputError(f"has grasps of {self.robot}, not {name}.", file=self.path, field="robot", hint=hint)
+        if not np.allclose(self.T_world_base, T_world_base, rtol=0.0, atol=1e-6):
+            hint = "give the --base of the grasps"
+            raise InputError("is another base.", file=self.path, field="T_world_base", hint=hint)
+
+    def check_map(self, file: Path, rows: int) -> None:
+        """Check that the grasps are of a map's file, which has this number of rows without flying pixels.
+
+        Raises:
+            InputError: the map is another one, or it changed since.
+        """
+        if self.map_sha256 != sha256(file) or self.target.rows.max(initial=-1) >= rows:
+            hint = "search for grasps again, in this map"
+            raise InputError("is of another map, or the map changed.", file=self.path, field="map_sha256", hint=hint)
+
+    def grasp(self, index: int, joints: int) -> Grasp:
+        """Return the grasp of a rank, from 0, of a robot with this number of joints.
+
+        Raises:
+            InputError: there is no such grasp, or it has no joint values.
+        """
+        if not 0 <= index < len(self.grasps):
+            hint = f"give 0 to {len(self.grasps) - 1}" if self.grasps else "search for grasps again"
+            raise InputError(f"is {index}, of {len(self.grasps)} grasps.", field="--grasp-index", hint=hint)
+        found = self.grasps[index]
+        q = found.q_pregrasp
+        if q is None or len(q) != joints or not np.isfinite(q).all():
+            hint = "search without --hand-only"
+            raise InputError("has no joint values.", file=self.path, field="q_pregrasp", hint=hint)
+        return found
+
+    def result(self, index: int | None, joints: int) -> GraspResult:
+        """Return the grasps, or that of one rank, as the result of a search; for errors see :meth:`grasp`."""
+        ranks = range(max(1, len(self.grasps))) if index is None else (index,)
+        grasps = tuple(self.grasp(rank, joints) for rank in ranks)
+        return GraspResult(self.target, grasps, {}, None, len(grasps), {}, map_version=0)
+
+
+def grasp_file(
+    result: GraspResult, sampler: GraspSampler, map_file: Path, *, robot: str, unknown: UnknownPolicy
+) -> dict[str, Any]:
+    """Return the content of a file of grasps as JSON values.
+
+    Args:
+        result: of the search.
+        sampler: with which it was made.
+        map_file: the map.
+        robot: name of the robot.
+        unknown: treatment of unknown space.
+    """
+    T = sampler.scene.T_world_base
+    return summary(result) | {
+        "robot": robot,
+        "T_world_base": {"translation": T[:3, 3].tolist(), "quaternion_wxyz": rotation_to_quat(T[:3, :3]).tolist()},
+        "margin_m": sampler.margin,
+        "arm_margin_m": max(sampler.margin, sampler.arm_margin),
+        "unknown_space": unknown,
+        "n_sigma": sampler.n_sigma,
+        "min_observations": sampler.min_observations,
+        "map_sha256": sha256(map_file),
+        "target_rows": result.target.rows.tolist(),
+    }
+
+
+def sha256(file: Path) -> str:
+    """Return the SHA-256 hash of a file."""
+    with file.open("rb") as handle:
+        return hashlib.file_digest(handle, "sha256").hexdigest()

@@ -1,0 +1,100 @@
+"""`splatbot plan-pick`: a complete pick in a map, executed in the twin of the map."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from splatbot.collision import RobotSpheres
+from splatbot.robots.panda import panda
+from splatbot.sim.motion import load_motion
+from splatbot.workspace import Workspace
+from tests.unit.cli.conftest import RunCommand, assert_refused
+from tests.unit.grasping.objects import OBJECTS, model
+
+pytest.importorskip("mujoco")
+
+
+@pytest.fixture
+def map_file(tmp_path: Path) -> Path:
+    path = tmp_path / "map.ply"
+    model().save(path)
+    Workspace(T_world_base=np.eye(4)).save(tmp_path / "scene.yaml")
+    return path
+
+
+@pytest.fixture
+def grasps(run: RunCommand, map_file: Path, tmp_path: Path) -> Path:
+    words = ("--target", "red box", "--wanted", 3, "--margin", 0.004, "--out", tmp_path / "grasp")
+    answer = run("grasp", "--map", map_file, *words)
+    assert answer.code == 0, answer.err
+    assert "splatbot plan-pick --map" in answer.out
+    return tmp_path / "grasp" / "grasp.json"
+
+
+def test_the_box_is_held_in_the_twin_and_each_motion_clears_the_true_objects(
+    run: RunCommand, map_file: Path, grasps: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    answer = run("plan-pick", "--map", map_file, "--grasp", grasps, "--speed", 0.5, "--out", out)
+    assert answer.code == 0, answer.err
+    for words in ("risen by", "touched nothing else", "beyond a margin of 4.0 mm"):
+        assert words in answer.out
+    written: dict[str, Any] = json.loads((out / "pick.json").read_text())
+    assert written["execute"]
+    assert written["simulated"]["rose_m"] == pytest.approx(0.15, abs=0.01)
+    assert not written["simulated"]["contacts"]
+    stages = [motion["stage"] for motion in written["motions"]]
+    assert stages == ["move", "approach", "lift", "lift"]
+    assert all(motion["certified"] for motion in written["motions"])
+    assert (out / "pick.html").stat().st_size > 100_000
+    robot, end = panda(), np.asarray(panda().home)
+    for motion in written["motions"]:
+        curve = load_motion(out / motion["file"], robot)
+        q = curve.at(np.linspace(0.0, curve.duration, 200))[0]
+        np.testing.assert_allclose(q[0], end, atol=1e-6)  # each begins where the one before ends
+        end = q[-1]
+        spheres = RobotSpheres(robot, opening=motion["opening_m"])
+        at = spheres.centers(q).reshape(-1, 3)
+        radii = np.tile(spheres.spheres.radii, len(q))
+        moving = np.tile(spheres.spheres.link > 0, len(q))
+        for name, solid in OBJECTS.items():
+            if name != "box":
+                assert (solid.distance(at[moving]) - radii[moving]).min() > 0.0
+    lifted = robot.tcp(end)[:3, 3]
+    taken = robot.tcp(load_motion(out / "2-approach.json", robot).position[-1])[:3, 3]
+    np.testing.assert_allclose(lifted - taken, (0.0, 0.0, 0.15), atol=2e-3)
+
+
+def test_a_pick_that_the_twin_does_not_hold_is_not_to_be_executed(
+    run: RunCommand, map_file: Path, grasps: Path, tmp_path: Path
+) -> None:
+    """A grasp that closes 3 cm above the box is planned, and holds nothing in physics."""
+    values = json.loads(grasps.read_text())
+    best = values["grasps"][0]
+    x, y, z = best["T_world_pregrasp"]["position"]
+    best["T_world_tcp"] = best["T_world_pregrasp"] | {"position": [x, y, z - 0.01]}
+    grasps.write_text(json.dumps(values))
+    out = tmp_path / "out"
+    answer = run("plan-pick", "--map", map_file, "--grasp", grasps, "--grasp-index", 0, "--speed", 0.5, "--out", out)
+    assert_refused(answer, "should not be executed: nothing held")
+    assert not json.loads((out / "pick.json").read_text())["execute"]
+
+
+def test_grasps_of_a_map_that_changed_are_refused(
+    run: RunCommand, map_file: Path, grasps: Path, tmp_path: Path
+) -> None:
+    model().select(torch.arange(10_000)).save(map_file)
+    words = ("--map", map_file, "--grasp", grasps, "--out", tmp_path / "out")
+    assert_refused(run("plan-pick", *words), "is of another map, or the map changed")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_rank_that_does_not_exist_is_refused(run: RunCommand, map_file: Path, grasps: Path) -> None:
+    words = ("--map", map_file, "--grasp", grasps, "--grasp-index", 7)
+    assert_refused(run("plan-pick", *words), "--grasp-index: is 7, of 3 grasps")
