@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,7 @@ from splatbot.robots.robot import RobotModel
 from splatbot.sim.contact_monitor import ClearanceMonitor, ContactEvent, ContactMonitor, MinimumClearance
 from splatbot.sim.controller import TwinController
 from splatbot.sim.effects.contact import ROBOT
-from splatbot.sim.maps.ellipsoids import merge
+from splatbot.sim.maps.ellipsoids import Ellipsoids, merge
 from splatbot.sim.recording import TwinRecording
 from splatbot.sim.scene import Clutter, Scene, SceneObject, SceneTask
 from splatbot.sim.solids import rpy_of
@@ -38,6 +38,9 @@ class MapPickConstants:
         clearance_period: [s] time between clearance computations.
         ellipsoids: largest number of ellipsoids of the target.
         thickness: [m] standard deviation of a surface point of the target, which thickens its ellipsoids.
+        inward: [m] half-axis of these ellipsoids across the surface, where the target is thick enough.
+        ray_radius: [m] radius around the inward normal in which the opposite side is searched.
+        shape_error: [m] depth to which the hand may touch the target on the approach, an error of the twin's shape.
         supports: cosine of the largest angle between the vertical and the normal of a contact that supports the target.
     """
 
@@ -45,6 +48,9 @@ class MapPickConstants:
     clearance_period: float = 0.02
     ellipsoids: int = 200
     thickness: float = 5e-4
+    inward: float = 5e-3
+    ray_radius: float = 4e-3
+    shape_error: float = 2e-3
     supports: float = 0.7
 
 
@@ -64,7 +70,7 @@ class MapPick:
         result: of the pick, with its certified motions.
         rose: height by which the target rose [m].
         wanted: height of the lift [m].
-        contacts: unintended contacts: all but those of the hand with the target after the approach.
+        contacts: unintended contacts: all but those of the hand with the target, of less than 2 mm before the closing.
         clearance: minimum clearance of the links before the hand from map and objects.
         recording: of the whole pick.
         notes: on the twin of the map.
@@ -147,6 +153,7 @@ def pick_on_map(
     def after(step: PickStep) -> None:
         if step.stage is PickStage.APPROACH:
             monitor.closing = monitor.time
+            held.loosen()
         elif step.stage is PickStage.CLOSE:
             held.release()
         if on_step is not None:
@@ -176,10 +183,13 @@ class _Monitor:
         self.recording, self._further = TwinRecording(twin.world), further
         self._due = self.time = 0.0
         self.closing = np.inf
+        self._early: dict[str, float] = {}
 
     def __call__(self, data: Any, time: float) -> None:
         self.time = time
         self.contacts.update(data, time)
+        if time <= self.closing:
+            self._early = {c.part: c.depth for c in self.contacts.found if c.other == TARGET}
         if time >= self._due:
             self.clearance.update(data, time)
             self._due = time + CONSTANTS.clearance_period
@@ -191,7 +201,10 @@ class _Monitor:
         """Return the contacts of the arm, without those of the hand with the target from the closing on."""
         hand = hand_parts(self.recording.world)
         return tuple(
-            c for c in self.contacts.found if not (c.other == TARGET and c.part in hand and c.first >= self.closing)
+            contact
+            for contact in self.contacts.found
+            if not (contact.other == TARGET and contact.part in hand)
+            or (contact.first < self.closing and self._early.get(contact.part, 0.0) > CONSTANTS.shape_error)
         )
 
 
@@ -206,12 +219,11 @@ def hand_parts(world: World) -> frozenset[str]:
 
 
 def _with_target(scene: Scene, clutter: Clutter, sampler: GraspSampler, target: Target) -> Scene:
-    """Replace the target's Gaussians in a scene by a movable object: ellipsoids on its completed surface."""
+    """Replace the target's Gaussians in a scene by a movable object."""
     T_base_world = inverse(sampler.scene.T_world_base)
     surface, balls = sampler.surface(target), target_spheres(sampler, target)
     points = transform_points(T_base_world, surface.points)
-    flat = np.broadcast_to(np.eye(3) * CONSTANTS.thickness**2, (len(points), 3, 3))
-    parts = merge(points, flat, np.ones(len(points)), points.mean(axis=0), CONSTANTS.ellipsoids)
+    parts = solid_shell(points, surface.normals @ T_base_world[:3, :3].T)
     middle = points.mean(axis=0)
     shapes = [
         {"kind": "ellipsoid", "at": at, "axes": axes, "rpy": rpy_of(R)}
@@ -228,6 +240,31 @@ def _with_target(scene: Scene, clutter: Clutter, sampler: GraspSampler, target: 
             "task": SceneTask(kind="grasp"),
         }
     )
+
+
+def solid_shell(points: Array, normals: Array) -> Ellipsoids:
+    """Cover a surface by ellipsoids that reach inwards, so that fingers do not press through it.
+
+    1. Points merge to flat ellipsoids, as the Gaussians of a map do.
+    2. Each ellipsoid grows inwards by 5 mm, or to half of the object's thickness there. Its outer side stays in place.
+
+    Args:
+        points: (P, 3) on the surface [m].
+        normals: (P, 3) outward unit normals.
+    """
+    flat = np.broadcast_to(np.eye(3) * CONSTANTS.thickness**2, (len(points), 3, 3))
+    parts = merge(points, flat, np.ones(len(points)), points.mean(axis=0), CONSTANTS.ellipsoids)
+    across = quat_to_rotation(parts.quats)[:, :, 0]  # the shortest axis
+    to_point = points[None] - parts.centers[:, None]
+    outward = normals[np.linalg.norm(to_point, axis=2).argmin(axis=1)]
+    across = across * np.where(np.einsum("ej,ej->e", across, outward) < 0.0, -1.0, 1.0)[:, None]
+    depth = -np.einsum("epj,ej->ep", to_point, across)
+    aside = np.linalg.norm(to_point + depth[:, :, None] * across[:, None], axis=2)
+    opposite = (aside < CONSTANTS.ray_radius) & (depth > CONSTANTS.thickness) & (across @ normals.T < 0.0)
+    thickness = np.where(opposite, depth, np.inf).min(axis=1)
+    half = np.maximum(np.minimum(CONSTANTS.inward, thickness / 2), parts.axes[:, 0])
+    centers = parts.centers - (half - parts.axes[:, 0])[:, None] * across
+    return replace(parts, centers=centers, axes=np.c_[half, parts.axes[:, 1:]])
 
 
 def _detach_target(twin: Twin) -> None:
@@ -251,16 +288,24 @@ def _detach_target(twin: Twin) -> None:
 
 
 class _HeldStill:
-    """Keeps the target at rest by damping of its joint: a weight of 2 N moves it by 2 µm a second."""
+    """Keeps the target at rest by damping of its joint [N s/m, N m s].
 
-    _DAMPING = 1e6  # [N s/m, N m s]
+    Before the closing a weight of 2 N moves it by 2 µm a second. While the fingers close, they centre the object as on
+    a table: at 0.1 m/s it resists with 20 N.
+    """
+
+    _AT_REST, _PUSHED = np.full((6, 1), 1e6), np.array([200.0] * 3 + [2.0] * 3)[:, None]
 
     def __init__(self, twin: Twin) -> None:
         model = twin.world.model
         first = int(model.body(OBJECT + TARGET).dofadr[0])
         self._damping = np.asarray(model.dof_damping).reshape(model.nv, -1)[first : first + 6, :1]
         self._before = self._damping.copy()
-        self._damping[:] = self._DAMPING
+        self._damping[:] = self._AT_REST
+
+    def loosen(self) -> None:
+        """Let fingers push the target."""
+        self._damping[:] = self._PUSHED
 
     def release(self) -> None:
         """Let the target move."""
