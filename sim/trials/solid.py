@@ -109,10 +109,11 @@ class SolidReach:
         self.robot, self.T, self.world = robot, T_world_base, world
         self._around = world.around(rows)
 
-    def reach(self, T_world_tcp: Array, T_world_pregrasp: Array, opening: float) -> Reached:
+    def reach(self, T_world_tcp: Array, T_world_pregrasp: Array, opening: float, width: float) -> Reached:
         """Implement :meth:`splatbot.grasping.reach.Reach.reach`."""
         near = SolidArm(self.robot, self.T, opening, self._around)
         far = SolidArm(self.robot, self.T, opening, self.world.whole)
+        closed = SolidArm(self.robot, self.T, width, self._around)
         chain = self.robot.chain
         found = solve_ik(
             self.robot, inverse(self.T) @ T_world_tcp, near=(chain.lower + chain.upper) / 2, seeds=CONSTANTS.ik_seeds
@@ -124,7 +125,7 @@ class SolidReach:
             return Reached(None, None, 0.0, 0.0, "the arm is in the way of it", "the arm is in the way of")
         for q in found:
             path = straight(near, near.free, q, T_world_pregrasp)
-            if path is not None and far.free(path[-1:])[0]:
+            if path is not None and far.free(path[-1:])[0] and closed.free(q[None])[0]:
                 half = (chain.upper - chain.lower) / 2
                 limits = float((np.minimum(q - chain.lower, chain.upper - q) / half).min())
                 return Reached(q, path[::-1].copy(), 0.0, limits)

@@ -118,7 +118,8 @@ def plan_pick(
     replace_files(folder, {name: write_text(text) for name, text in texts.items()})
     _print(picked, known, folder)
     if not picked:
-        raise SplatbotError(f"should not be executed: {picked.problems[0]}.", field="pick", hint=_HINT)
+        first = picked.problems[0].split("; ")[0].rstrip(".")  # the table has all of them
+        raise SplatbotError(f"should not be executed: {first}.", field="pick", hint=_HINT)
     return 0
 
 

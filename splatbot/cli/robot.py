@@ -9,6 +9,7 @@ import tyro
 
 if TYPE_CHECKING:
     from splatbot.robots.bodies.check import Part
+    from splatbot.robots.robot import RobotModel
 
 
 def robot(
@@ -267,6 +268,25 @@ def _info(name: str) -> None:
             ("slack", f"{1e3 * model.slack:.3g} mm"),
             ("pairs of links that may not touch", str(len(model.self_collision_pairs))),
             ("home", " ".join(f"{value:.4g}" for value in model.home)),
-            ("gripper", f"opens {2 * model.gripper.stroke:g} m" if model.gripper else "none"),
+            ("gripper", _gripper_text(model)),
+            ("tool (TCP)", _tool_text(model)),
+            *([("mass", f"last link with its hand {model.inertials[-1].mass:.3g} kg")] if model.inertials else []),
         ]
     )
+
+
+def _gripper_text(model: RobotModel) -> str:
+    gripper = model.gripper
+    if gripper is None:
+        return "none"
+    return f"opens {2 * gripper.stroke:g} m, {gripper.force:g} N, {gripper.speed:g} m/s each finger"
+
+
+def _tool_text(model: RobotModel) -> str:
+    """Describe the tool frame, which users compare with that of their controller."""
+    import numpy as np
+
+    T = model.T_link_tcp
+    x, y, z = (f"{value:+.4f}" for value in T[:3, 3])
+    turn = "" if np.allclose(T[:3, :3], np.eye(3)) else ", turned"
+    return f"at {x} {y} {z} m in the frame of {model.joints[-1].name}{turn}; z is the approach, fingers close along y"

@@ -194,7 +194,7 @@ class MapPickPlanner:
             return f"it cannot be lifted: {lift_off.reason.rstrip('.')}"
         lift = self._up(loaded, obstacles.around_held, lift_off.path.waypoints[-1], self.o.lift - self.o.lift_off)
         if not lift or lift.path is None:
-            return f"it cannot be lifted: {lift.reason.rstrip('.')}"
+            return f"it cannot be lifted: with the object in the hand, {lift.reason.rstrip('.')}"
         to_pregrasp = Segment(plan.path, planner.arm, obstacles.whole, avoids_moving)
         straight = [
             Segment(path, arm, field, avoids_moving, self._guards(field))

@@ -104,13 +104,14 @@ def link_guards(
 class ReachabilityCheck(Protocol):
     """Checks whether an arm reaches a grasp."""
 
-    def reach(self, T_world_tcp: Array, T_world_pregrasp: Array, opening: float) -> Reached:
+    def reach(self, T_world_tcp: Array, T_world_pregrasp: Array, opening: float, width: float) -> Reached:
         """Find joint positions at the grasp and a straight approach to it.
 
         Args:
             T_world_tcp: (4, 4) pose of the tool at the grasp.
             T_world_pregrasp: (4, 4) pose of the tool at the start of the approach.
             opening: finger opening during the approach [m].
+            width: finger opening at the closed grasp [m].
         """
         ...
 
@@ -176,7 +177,7 @@ class ArmReach:
         """Return the arm's spheres with the fingers opened to ``opening`` [m], rounded up to 2 mm."""
         return self._arm(int(np.ceil(opening / HANDS.opening_step - 1e-6)))
 
-    def reach(self, T_world_tcp: Array, T_world_pregrasp: Array, opening: float) -> Reached:
+    def reach(self, T_world_tcp: Array, T_world_pregrasp: Array, opening: float, width: float) -> Reached:
         """Check a grasp; see :class:`ReachabilityCheck`."""
         arm = self.arm(opening)
         goals = goal_configurations(
@@ -190,6 +191,7 @@ class ArmReach:
         if not len(goals.q):
             kind = "no posture reaches" if goals.status is PlanStatus.NO_IK_SOLUTION else "the arm is in the way of"
             return Reached(None, None, 0.0, 0.0, goals.reason.rstrip("."), kind)
+        closed = RobotSpheres(self.robot, T_world_base=self._open.T_world_base, opening=width, margin=arm.margin)
         reason, kind = "", ""
         for q in goals.q:
             back = straight_line(arm, self.around, q, T_world_pregrasp)
@@ -202,6 +204,9 @@ class ArmReach:
                 continue
             if self.departure is not None and self._open.check(self.departure, start[None]).in_collision[0]:
                 reason, kind = "no plan may end at its pre-grasp", "start where no plan may end"
+                continue
+            if closed.check(self.around, q[None]).in_collision[0]:
+                reason, kind = "the closed fingers touch its surroundings", "close in the surroundings"
                 continue
             way = back.path.waypoints
             near = next((guard for guard in self._guards if guard.meets(way)), None)

@@ -358,7 +358,7 @@ class Search:
         return judged, kind
 
     def _with_arm(self, grasp: Grasp, reach: ReachabilityCheck) -> tuple[Grasp, str]:
-        reached = reach.reach(grasp.T_world_tcp, grasp.T_world_pregrasp, grasp.opening)
+        reached = reach.reach(grasp.T_world_tcp, grasp.T_world_pregrasp, grasp.opening, grasp.width)
         if reached.q is None or reached.path is None:
             return replace(grasp, rejected=reached.reason), reached.kind
         found = _with_terms(grasp, arm_terms(reached))

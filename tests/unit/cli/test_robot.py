@@ -46,7 +46,10 @@ def test_a_name_is_replaced_only_on_purpose_and_a_hand_is_attached(
     file = ur5(tmp_path)
     assert run("robot", "add", file, "--tip", "tool0", "--gripper", "2f85").code == 0
     assert run("robot", "list").out.split()[-1] == "ur5-2f85"
-    assert "opens 0.085 m" in run("robot", "info", "ur5-2f85").out
+    info = run("robot", "info", "ur5-2f85").out
+    assert "opens 0.085 m" in info
+    assert "m in the frame of wrist_3_joint; z is the approach, fingers close along y" in info
+    assert "last link with its hand" in info
     again = run("robot", "add", file, "--tip", "tool0", "--gripper", "2f85")
     assert again.code == 2
     assert "exists" in again.err

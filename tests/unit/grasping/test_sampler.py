@@ -153,7 +153,7 @@ def test_grasps_that_avoid_moving_regions_come_first_and_a_note_reports_the_othe
 
 
 class _Nowhere:
-    def reach(self, T_world_tcp: Array, T_world_pregrasp: Array, opening: float) -> Reached:
+    def reach(self, T_world_tcp: Array, T_world_pregrasp: Array, opening: float, width: float) -> Reached:
         return Reached(None, None, 0.0, 0.0, "it is too far", "are too far")
 
 
