@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -30,9 +31,11 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from splatbot.collision import GaussianCollisionField
+    from splatbot.gaussians import GaussianModel
     from splatbot.planning import GaussianRRTStar, JointTrajectory, PlanResult
     from splatbot.planning import Path as JointPath
     from splatbot.planning.closest import ClosestApproach
+    from splatbot.results.plan_obstacles import PlanObstacles
     from splatbot.results.region_plan import RegionPlan
     from splatbot.robots.robot import RobotModel
 
@@ -61,7 +64,7 @@ def plan(
     """Plan a path of an arm among the Gaussians of a map.
 
     Writes the certified trajectory (trajectory.json as ROS JointTrajectory, trajectory.csv at 1 kHz), plan.json and
-    plan.png. The page plan.html animates arm and map.
+    plan.png. The page plan.html animates arm and map. A start or goal in collision is drawn in refused.png.
 
     Examples:
         splatbot plan --map runs/latest --start home --goal 0.5 -0.3 0 -2.0 0 1.9 0.8
@@ -150,12 +153,14 @@ def plan(
             tell=tell,
         )
     result, trajectory = found.result, found.trajectory
+    folder = out if out is not None else Path("runs") / "plan"
+    if result.path is None:
+        _draw_refusal(folder / "refused.png", model, around, arm, found.planner, result, here, wanted)
     around.check(result)
     result.unwrap()
     assert trajectory is not None
     covers = found.scope(around, confidence=confidence)
     nearest = closest_approach(found.planner.arm, found.planner.field, trajectory, around.kind)
-    folder = out if out is not None else Path("runs") / "plan"
     title = f"{arm.name} in {map.resolve().name}"
     texts = {
         "plan.json": json.dumps(
@@ -205,6 +210,46 @@ def _plan(
         return plan_in_region(make_planner, plan_once, ends, error, confidence=confidence, speed=speed)
     tell("planning")
     return plan_at_margin(make_planner(margin_value(margin)), plan_once, speed=speed)
+
+
+def _draw_refusal(
+    path: Path,
+    model: GaussianModel,
+    around: PlanObstacles,
+    robot: RobotModel,
+    planner: GaussianRRTStar,
+    result: PlanResult,
+    start: NDArray[np.float64],
+    goal: Any,
+) -> None:
+    """Draw the end of a plan that is in collision; other refusals have no picture."""
+    import numpy as np
+
+    from splatbot.atomic import atomic_write
+    from splatbot.geometry import inverse
+    from splatbot.planning import PlanStatus, PoseGoal
+    from splatbot.planning.causes import collision
+    from splatbot.planning.ik import solve_ik
+    from splatbot.report.plan_page import refused_png
+    from splatbot.robots.appearance import appearance
+
+    arm, field = planner.arm, planner.field
+    ends = {PlanStatus.START_STATE_IN_COLLISION: start, PlanStatus.GOAL_IN_COLLISION: goal}
+    q, cause = ends.get(result.status), result.cause
+    if isinstance(q, PoseGoal):  # of its postures, that nearest to the start
+        postures = solve_ik(robot, inverse(arm.T_world_base) @ np.asarray(q.T_world_tcp), near=start).q
+        q = postures[0] if len(postures) else None
+        cause = None if q is None else collision(arm, field, q)
+    if not isinstance(q, np.ndarray) or cause is None or cause.at_base is None or cause.gaussian < 0:
+        return
+    picture = refused_png(
+        model, arm, q, appearance(robot), robot.fk, point=np.array(cause.at_base),
+        reason=cause.deep_in(around.kind(cause.gaussian)), solids=around.solids,
+    )  # fmt: skip
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_write(path) as file:
+        file.write(picture)
+    print(f"picture of the collision: {path}", file=sys.stderr)
 
 
 def _summary(

@@ -33,12 +33,14 @@ class PlanPageConstants:
         crop_radius: [m] radius of the map around the base that is shown.
         frames: postures of the animation.
         ghosts: postures in the image.
+        shown_solids: [m] radius around a collision in which obstacles beyond the map are drawn.
     """
 
     max_points: int = 40_000
     crop_radius: float = 1.6
     frames: int = 80
     ghosts: int = 5
+    shown_solids: float = 0.3
 
 
 CONSTANTS = PlanPageConstants()
@@ -47,7 +49,7 @@ CONSTANTS = PlanPageConstants()
 _START, _END = np.array([0.15, 0.45, 0.9]), np.array([0.95, 0.5, 0.1])  # tints of the ends
 _START_SHADE, _END_SHADE = (0.49, 0.67, 0.94), (0.97, 0.7, 0.46)  # as the shaded arms look
 _FROM = np.array([-1.3, 1.3, 1.0])  # direction from the middle of the motion to the camera, in the base frame
-_NEAREST, _TOOL = (1.0, 0.15, 0.2), (0.2, 0.9, 0.95)
+_NEAREST, _TOOL, _SOLID = (1.0, 0.15, 0.2), (0.2, 0.9, 0.95), (0.65, 0.3, 0.95)
 
 
 def plan_html(
@@ -168,6 +170,53 @@ def plan_png(
         view = with_ring(view, (camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy), _NEAREST)
     view = with_legend(view, legend)
     return to_png(with_scale(view, camera, away, "at the middle of the picture"), "rgb")
+
+
+def refused_png(
+    model: GaussianModel,
+    arm: RobotSpheres,
+    q: Array,
+    parts: Sequence[DrawnPart],
+    fk: Callable[[Array], Array],
+    *,
+    point: Array,
+    reason: str,
+    solids: GaussianModel | None = None,
+    width: int = 960,
+) -> bytes:
+    """Render the map with the arm at a configuration that is refused, and a ring at the place of the collision.
+
+    Args:
+        model: the map.
+        arm: collision spheres of the robot with the pose of its base.
+        q: (J,) the configuration [rad or m].
+        parts: appearance of the robot.
+        fk: returns the poses T_base_link (K, L, 4, 4) of its links at joint positions (K, J).
+        point: (3,) place of the collision [m, base].
+        reason: of the refusal, for the legend.
+        solids: obstacles that are not in the map. Those near the place are drawn in violet.
+        width: of the image [px]; the height is 3/4 of it.
+    """
+    camera = Camera(0.9 * width, 0.9 * width, (width - 1) / 2, (width * 3 // 4 - 1) / 2, width, width * 3 // 4)
+    points = transform_points(inverse(arm.T_world_base), arm.centers(q[None])[0])
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    away = float(np.linalg.norm(points - middle, axis=1).max()) / np.sin(np.arctan2(camera.height / 2, camera.fy))
+    T_world_camera = arm.T_world_base @ look_at(middle + away * _FROM / np.linalg.norm(_FROM), middle)
+    at = transform_points(arm.T_world_base, point[None])[0]
+    drawn = [model.select(torch.from_numpy(_within(model, inverse(arm.T_world_base))))]
+    legend = [("arm at the refused configuration", _END_SHADE), (reason, _NEAREST)]
+    if solids is not None and len(solids):
+        centers = solids.means.double().numpy()
+        near = np.linalg.norm(centers - at, axis=1) < CONSTANTS.shown_solids
+        drawn.append(_dots(centers[near], 0.003, _SOLID))
+        legend.append(("obstacles that are not in the map: support plane, unknown space", _SOLID))
+    view, depth = map_view(GaussianModel.concatenate(drawn), camera, T_world_camera)
+    draw_robot(
+        view, depth, camera, T_world_camera, parts, arm.T_world_base @ fk(q[None])[0], tint=_END_SHADE, opacity=0.8
+    )
+    x, y, z = transform_points(inverse(T_world_camera), at[None])[0]
+    view = with_ring(view, (camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy), _NEAREST)
+    return to_png(with_scale(with_legend(view, legend), camera, away, "at the middle of the picture"), "rgb")
 
 
 def _dots(points: Array, radius: float, color: Color) -> GaussianModel:

@@ -113,7 +113,12 @@ class PlanObstacles:
     ) -> None:
         self._field, self._model, self._arm, self.policy = field, model, arm, policy
         self._start, self._plane, self._space = np.asarray(start), plane, space
-        self._tiles = 0
+        self._tiles, self._solids = 0, GaussianModel.empty(0)
+
+    @property
+    def solids(self) -> GaussianModel:
+        """Return the obstacles of the latest field that are not in the map, as Gaussians."""
+        return self._solids
 
     @property
     def map_field(self) -> GaussianCollisionField:
@@ -135,6 +140,7 @@ class PlanObstacles:
             tiles = support_tiles(self._plane, self._arm, self._start, margin=margin, n_sigma=self._field.n_sigma)
         self._tiles = len(tiles)
         solids = GaussianModel.concatenate([tiles, self._unknown(margin)])
+        self._solids = solids
         if not len(solids):
             return self._field
         # No gate on observations removes a solid.

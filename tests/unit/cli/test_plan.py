@@ -80,6 +80,25 @@ def test_a_file_that_is_no_json_and_two_goals_are_refused(run: RunCommand, map_f
     assert_refused(run(*words), "must be given, one of them")
 
 
+@pytest.mark.parametrize(
+    "goal",
+    [("--goal", 0.0, 0.9, 0.0, -1.9, 0.0, 2.8, 0.8), ("--goal-pose", 0.5, 0.0, -0.05, 0, 1, 0, 0)],
+    ids=["joints", "pose"],
+)
+def test_a_goal_in_the_table_is_refused_with_a_picture_of_the_arm_there(
+    run: RunCommand, map_file: Path, tmp_path: Path, goal: tuple[Any, ...]
+) -> None:
+    out = tmp_path / "out"
+    answer = run("plan", "--map", map_file, *BASE, "--start", "home", *goal, "--out", out)
+    assert_refused(answer, "mm deep")
+    assert str(out / "refused.png") in answer.err
+    picture = cv2.imread(str(out / "refused.png"))
+    assert picture is not None
+    red = (picture[..., 2] > 200) & (picture[..., 1] < 90) & (picture[..., 0] < 100)
+    assert red.sum() > 200  # the ring
+    assert sorted(path.name for path in out.iterdir()) == ["refused.png"]
+
+
 def test_a_certified_trajectory_is_written_with_its_pictures(run: RunCommand, map_file: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     answer = run("plan", "--map", map_file, *BASE, "--start", "home", "--goal", *GOAL, "--out", out)
