@@ -28,6 +28,7 @@ from splatbot.grasping.types import GraspResult, NoGraspError
 from splatbot.logs.raycast import RaycastScene, RaycastSurface
 from splatbot.logs.textures import Texture
 from splatbot.protocols import Array
+from splatbot.report.sphere_gaussians import sphere_gaussians
 from splatbot.robots.hands import panda_2f85, panda_2f140
 from splatbot.robots.panda import panda
 from splatbot.segmentation import SegmentedMap, segment
@@ -436,3 +437,19 @@ def test_the_edge_of_a_low_object_stays_sharp_where_only_similar_normals_are_ave
         wall = (surface.points[:, 2] < HIGH - 0.6 * RIM) & (r > (INNER + OUTER) / 2)
         off.append(np.degrees(np.median(np.abs(np.arcsin(surface.normals[wall, 2])))))
     assert off[1] < 0.8 * off[0]
+
+
+def test_closed_fingers_that_would_touch_a_neighbour_are_refused_although_the_open_hand_is_free() -> None:
+    """A ball between the open fingers is where one of them ends."""
+    T = np.diag([1.0, -1.0, -1.0, 1.0])
+    T[:3, 3] = (0.5, 0.0, 0.3)
+    above = T.copy()
+    above[2, 3] += 0.1
+    ball = sphere_gaussians(np.array([[0.5, 0.02, 0.3]]), np.array([0.003]), np.array([0.5, 0.5, 0.5]), 0.99)
+    free = ArmReach(panda(), np.eye(4), GaussianCollisionField(GaussianModel.empty(0)))
+    near = ArmReach(panda(), np.eye(4), GaussianCollisionField(ball))
+    assert free.reach(T, above, 0.08, 0.02).q is not None
+    assert near.reach(T, above, 0.08, 0.076).q is not None
+    reached = near.reach(T, above, 0.08, 0.02)
+    assert reached.q is None
+    assert reached.kind == "close in the surroundings"
