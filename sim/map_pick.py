@@ -21,7 +21,6 @@ from splatbot.robots.robot import RobotModel
 from splatbot.sim.contact_monitor import ClearanceMonitor, ContactEvent, ContactMonitor, MinimumClearance
 from splatbot.sim.controller import TwinController
 from splatbot.sim.effects.contact import ROBOT
-from splatbot.sim.maps.ellipsoids import CONSTANTS as ELLIPSOIDS
 from splatbot.sim.maps.ellipsoids import Ellipsoids, merge
 from splatbot.sim.recording import TwinRecording
 from splatbot.sim.scene import Clutter, Scene, SceneObject, SceneTask
@@ -246,8 +245,8 @@ def _with_target(scene: Scene, clutter: Clutter, sampler: GraspSampler, target: 
 def solid_shell(points: Array, normals: Array) -> Ellipsoids:
     """Cover a surface by ellipsoids that reach inwards, so that fingers do not press through it.
 
-    1. Points merge to flat ellipsoids, as the Gaussians of a map do. They end where their points do: a uniform
-       distribution of standard deviation σ ends at √3 σ. Larger ones would reach beyond the edges of the target.
+    1. Points merge to flat ellipsoids, as the Gaussians of a map do. They overlap, and reach up to 4 mm beyond an edge;
+       smaller ones taper there, so that fingers at a rim squeeze the target out.
     2. Each ellipsoid grows inwards by 5 mm, or to half of the object's thickness there. Its outer side stays in place.
 
     Args:
@@ -266,8 +265,7 @@ def solid_shell(points: Array, normals: Array) -> Ellipsoids:
     thickness = np.where(opposite, depth, np.inf).min(axis=1)
     half = np.maximum(np.minimum(CONSTANTS.inward, thickness / 2), parts.axes[:, 0])
     centers = parts.centers - (half - parts.axes[:, 0])[:, None] * across
-    along = parts.axes[:, 1:] * np.sqrt(3.0) / ELLIPSOIDS.tangent_sigmas
-    return replace(parts, centers=centers, axes=np.c_[half, along])
+    return replace(parts, centers=centers, axes=np.c_[half, parts.axes[:, 1:]])
 
 
 def _detach_target(twin: Twin) -> None:

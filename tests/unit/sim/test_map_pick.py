@@ -39,7 +39,7 @@ def test_a_shell_follows_the_surface_and_reaches_inwards(size: tuple[float, floa
     assert np.percentile(nearest, 95) < 1.5
     reach = shell.centers[:, None] + R.transpose(0, 2, 1) * shell.axes[:, :, None]  # the ends of the half-axes
     reach = np.concatenate([reach, 2 * shell.centers[:, None] - reach], axis=1).reshape(-1, 3)
-    assert (np.abs(reach) - np.array(size) / 2).max() < 3e-3  # beyond no face, but for cells at an edge
+    assert (np.abs(reach) - np.array(size) / 2).max() < 4.5e-3  # beyond faces only at their edges
     inner = np.percentile(shell.axes.min(axis=1), 20)
     assert inner >= 0.8 * min(CONSTANTS.inward, min(size) / 2)
 
