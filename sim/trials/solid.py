@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from splatbot.collision import RobotSpheres
 from splatbot.geometry import inverse
 from splatbot.grasping.affordance import Target
-from splatbot.grasping.pick_planner import PickPlan, Segment, in_hand, raised, target_spheres, within
+from splatbot.grasping.attached import within
+from splatbot.grasping.pick_planner import PickPlan, Segment, in_hand, raised, target_spheres
 from splatbot.grasping.pick_types import PickOptions
 from splatbot.grasping.reach import Reached
 from splatbot.grasping.sampler import GraspSampler

@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from splatbot.errors import InputError
+from splatbot.grasping.surface import GraspSurface
 from splatbot.protocols import Array
 
 
@@ -17,10 +19,14 @@ class AttachedConstants:
     Args:
         finest_cell: [m] smallest cell size that is tried.
         coarsening: factor on the cell size until the number of spheres fits.
+        sigmas: standard deviations to which the Gaussians of an attached object are inflated.
+        enclosed_sides: axis directions of six in which the object must surround a stray Gaussian; a cup is open in one.
     """
 
     finest_cell: float = 0.01
     coarsening: float = 1.25
+    sigmas: float = 1.0
+    enclosed_sides: int = 5
 
 
 CONSTANTS = AttachedConstants()
@@ -58,3 +64,32 @@ def covering_spheres(points: Array, reach: Array, *, max_spheres: int = 100) -> 
     radius = np.zeros(count)
     np.maximum.at(radius, group, np.linalg.norm(points - center[group], axis=1) + reach)
     return np.c_[center, radius]
+
+
+def object_spheres(surface: GraspSurface) -> Array:
+    """Cover a surface, completed on its unobserved sides, by spheres (A, 4) (x, y, z, radius) [m, world].
+
+    Each surface point is inflated by its sampling radius where it was completed, and by its standard deviation along
+    the normal.
+    """
+    return covering_spheres(
+        surface.points, np.where(surface.observed, 0.0, surface.spread) + CONSTANTS.sigmas * surface.normal_std
+    )
+
+
+def within(points: Array, spheres: Array) -> NDArray[np.bool_]:
+    """Return which points (P, 3) are strays inside of an object that spheres (A, 4) cover.
+
+    A point is inside if a sphere contains it, or if spheres lie in at least five of the six axis directions from it.
+    """
+    low, high = (spheres[:, :3] - spheres[:, 3:]).min(axis=0), (spheres[:, :3] + spheres[:, 3:]).max(axis=0)
+    found = np.zeros(len(points), np.bool_)
+    rows = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
+    between = spheres[None, :, :3] - points[rows, None]
+    sides = np.zeros(len(rows), np.int64)
+    for k in range(3):
+        aligned = np.linalg.norm(np.delete(between, k, axis=2), axis=2) < spheres[:, 3]
+        sides += (aligned & (between[..., k] > 0)).any(axis=1)
+        sides += (aligned & (between[..., k] < 0)).any(axis=1)
+    found[rows] = (sides >= CONSTANTS.enclosed_sides) | (np.linalg.norm(between, axis=2) <= spheres[:, 3]).any(axis=1)
+    return found

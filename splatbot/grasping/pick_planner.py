@@ -8,13 +8,13 @@ from typing import Protocol
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.errors import InputError
 from splatbot.geometry import inverse, transform_points
 from splatbot.grasping.affordance import Target
-from splatbot.grasping.attached import covering_spheres
+from splatbot.grasping.attached import object_spheres, within
 from splatbot.grasping.hands import CONSTANTS as HANDS
 from splatbot.grasping.moved_target import moved_grasp, moved_sampler
 from splatbot.grasping.obstacles import around_target
@@ -26,22 +26,6 @@ from splatbot.planning import GaussianRRTStar, JointGoal, Path, PoseGoal
 from splatbot.planning.cartesian import StraightResult, straight_line
 from splatbot.planning.goals import goal_configurations
 from splatbot.protocols import Array
-
-
-@dataclass(frozen=True)
-class PickConstants:
-    """Constants of picks.
-
-    Args:
-        attached_sigmas: standard deviations to which the Gaussians of an attached object are inflated.
-        enclosed_sides: axis directions of six in which the object must surround a stray Gaussian; a cup is open in one.
-    """
-
-    attached_sigmas: float = 1.0
-    enclosed_sides: int = 5
-
-
-CONSTANTS = PickConstants()
 
 
 @dataclass(frozen=True, eq=False)
@@ -298,33 +282,8 @@ class Adjusted:
 
 
 def target_spheres(sampler: GraspSampler, target: Target) -> Array:
-    """Cover the surface of a target, completed on its unobserved sides, by spheres (A, 4) (x, y, z, radius) [m, world].
-
-    Each surface point is inflated by its sampling radius where it was completed, and by its standard deviation along
-    the normal.
-    """
-    surface = sampler.surface(target)
-    return covering_spheres(
-        surface.points, np.where(surface.observed, 0.0, surface.spread) + CONSTANTS.attached_sigmas * surface.normal_std
-    )
-
-
-def within(points: Array, spheres: Array) -> NDArray[np.bool_]:
-    """Return which points (P, 3) are strays inside of an object that spheres (A, 4) cover.
-
-    A point is inside if a sphere contains it, or if spheres lie in at least five of the six axis directions from it.
-    """
-    low, high = (spheres[:, :3] - spheres[:, 3:]).min(axis=0), (spheres[:, :3] + spheres[:, 3:]).max(axis=0)
-    found = np.zeros(len(points), np.bool_)
-    rows = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
-    between = spheres[None, :, :3] - points[rows, None]
-    sides = np.zeros(len(rows), np.int64)
-    for k in range(3):
-        aligned = np.linalg.norm(np.delete(between, k, axis=2), axis=2) < spheres[:, 3]
-        sides += (aligned & (between[..., k] > 0)).any(axis=1)
-        sides += (aligned & (between[..., k] < 0)).any(axis=1)
-    found[rows] = (sides >= CONSTANTS.enclosed_sides) | (np.linalg.norm(between, axis=2) <= spheres[:, 3]).any(axis=1)
-    return found
+    """Cover the completed surface of a target by spheres; see :func:`splatbot.grasping.attached.object_spheres`."""
+    return object_spheres(sampler.surface(target))
 
 
 def in_hand(arm: RobotSpheres, q: Array, spheres: Array) -> Array:

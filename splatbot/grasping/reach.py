@@ -142,6 +142,9 @@ class ArmReach:
             from it. If None, this is not checked.
         unknown: field of unknown space. The links before the hand keep both margins from it on the whole approach.
         seed: seed of inverse kinematics.
+
+    Attributes:
+        around_held: field that the closed fingers avoid: ``around``, or the same without strays inside of the target.
     """
 
     def __init__(
@@ -161,6 +164,7 @@ class ArmReach:
             if not 0.0 <= value < np.inf:
                 raise InputError(f"is {value}.", field=name, hint="give metres, 0 or more")
         self.robot, self.around, self.whole, self.seed = robot, around, whole, seed
+        self.around_held = around
         self.departure = departure
         stroke = hand_of(robot).stroke
 
@@ -205,7 +209,7 @@ class ArmReach:
             if self.departure is not None and self._open.check(self.departure, start[None]).in_collision[0]:
                 reason, kind = "no plan may end at its pre-grasp", "start where no plan may end"
                 continue
-            if closed.check(self.around, q[None]).in_collision[0]:
+            if closed.check(self.around_held, q[None]).in_collision[0]:
                 reason, kind = "the closed fingers touch its surroundings", "close in the surroundings"
                 continue
             way = back.path.waypoints

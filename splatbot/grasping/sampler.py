@@ -121,9 +121,19 @@ class GraspSampler:
             model = with_balls(model, self.moving, n_sigma=self.n_sigma, observations=self.min_observations)
         return GaussianCollisionField(model, self.n_sigma, min_observations=self.min_observations)
 
-    def reach(self, around: GaussianCollisionField) -> ReachabilityCheck | None:
-        """Return the reachability check against the map without the target; None if only the hand is checked."""
-        return None if self._make_reach is None else self._make_reach(around, self.field)
+    def reach(
+        self, around: GaussianCollisionField, around_held: GaussianCollisionField | None = None
+    ) -> ReachabilityCheck | None:
+        """Return the reachability check against the map without the target; None if only the hand is checked.
+
+        The closed fingers are checked against ``around_held``, by default the same.
+        """
+        if self._make_reach is None:
+            return None
+        found = self._make_reach(around, self.field)
+        if around_held is not None and isinstance(found, ArmReach):
+            found.around_held = around_held
+        return found
 
     def reach_avoiding_moving(self, around: GaussianModel) -> ReachabilityCheck | None:
         """Return the reachability check that also avoids the regions where motion was observed.

@@ -15,6 +15,7 @@ from splatbot.collision import GaussianCollisionField
 from splatbot.gaussians import GaussianModel
 from splatbot.grasping.affordance import Target
 from splatbot.grasping.antipodal import Pairs, PairSearch, antipodal_pairs
+from splatbot.grasping.attached import object_spheres, within
 from splatbot.grasping.doubts import doubt
 from splatbot.grasping.hands import CONSTANTS as HANDS
 from splatbot.grasping.hands import Hands, measure_hands, palm_free, place_hands, usable_opening
@@ -163,9 +164,15 @@ class Search:
         if self.s.raw is not None:
             scored = self._outside_measured(scored)
             self.log.stage("measured depth")
-        grasps = self._reached(scored, self.s.reach(self.around), self.s.reach_avoiding_moving(self.model))
+        reach = self.s.reach(self.around, self._around_held())
+        grasps = self._reached(scored, reach, self.s.reach_avoiding_moving(self.model))
         self.log.stage("reach")
         return grasps
+
+    def _around_held(self) -> GaussianCollisionField:
+        """Return the field without stray Gaussians inside of the target, which move with it."""
+        inside = within(self.model.means.detach().double().numpy(), object_spheres(self.surface))
+        return self.s.collision_field(self.model.select(torch.from_numpy(~inside))) if inside.any() else self.around
 
     def _contacts(self, samples: int) -> None:
         self.found: PairSearch = antipodal_pairs(
