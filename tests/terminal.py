@@ -78,6 +78,7 @@ def at_a_terminal(
             if cwd is not None:
                 os.chdir(cwd)
             _resize(0, columns)
+            signal.signal(signal.SIGINT, signal.SIG_DFL)  # background jobs inherit that it is ignored
             values = {k: v for k, v in os.environ.items() if k not in ("COLUMNS", "LINES", "NO_COLOR")}
             values |= {"TERM": "xterm-256color", "OMP_NUM_THREADS": "1", **(environment or {})}
             os.execve(sys.executable, [sys.executable, "-m", "splatbot", *words], values)
