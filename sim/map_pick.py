@@ -110,7 +110,6 @@ def pick_on_map(
     *,
     start: Array,
     seed: int = 0,
-    stop: Callable[[], bool] | None = None,
     on_step: Callable[[PickStep], None] | None = None,
     watch: Callable[[World], Callable[[Any, float], None]] | None = None,
 ) -> MapPick:
@@ -132,7 +131,6 @@ def pick_on_map(
         options: of the pick.
         start: (J,) configuration at which the pick begins [rad or m].
         seed: of small displacements of the target in the twin; 0 for none.
-        stop: polled continuously; True ends the pick.
         on_step: called after each stage.
         watch: returns a further callback for the compiled world, as a video.
 
@@ -160,7 +158,7 @@ def pick_on_map(
             on_step(step)
 
     before = float(twin.data.body(OBJECT + TARGET).xipos[2])
-    picker = Picker(sampler, controller, controller.gripper, options=options, stop=stop, on_step=after)
+    picker = Picker(sampler, controller, controller.gripper, options=options, on_step=after)
     result = picker.pick(target, grasps=grasps)
     rose = float(twin.data.body(OBJECT + TARGET).xipos[2]) - before
     return MapPick(

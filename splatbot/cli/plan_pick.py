@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import signal
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -94,7 +93,7 @@ def plan_pick(
     robot = load_robot(known.robot)
     grasps = known.result(grasp_index, len(robot))
     here = joint_values(start, robot, "--start")
-    with steps() as tell, _interrupted() as stop:
+    with steps() as tell:
         tell("segmenting the objects of the map")
         objects = graspable_objects(map, _base(map, known))
         known.check_map(file, len(objects.scene.model))
@@ -106,7 +105,7 @@ def plan_pick(
         with _film(video) as watch:
             picked = pick_on_map(
                 _scene(map, known, with_camera=video is not None), robot, sampler, known.target, grasps,
-                options, start=here, seed=seed, stop=stop, on_step=lambda step: tell(f"{step.stage}: {step.note}"),
+                options, start=here, seed=seed, on_step=lambda step: tell(f"{step.stage}: {step.note}"),
                 watch=watch,
             )  # fmt: skip
     folder = out if out is not None else Path("runs") / "pick"
@@ -182,22 +181,6 @@ def _film(path: Path | None) -> Iterator[Callable[[Any], Any] | None]:
             return video
 
         yield watch
-
-
-@contextmanager
-def _interrupted() -> Iterator[Callable[[], bool]]:
-    """Yield a function that returns whether Ctrl-C was pressed; the second one ends the process."""
-    pressed: list[int] = []
-
-    def press(number: int, frame: Any) -> None:
-        pressed.append(number)
-        signal.signal(signal.SIGINT, before)
-
-    before = signal.signal(signal.SIGINT, press)
-    try:
-        yield lambda: bool(pressed)
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 def _names(picked: MapPick) -> list[str]:
