@@ -105,7 +105,7 @@ def plan_pick(
         with _film(video) as watch:
             picked = pick_on_map(
                 _scene(map, known, with_camera=video is not None), robot, sampler, known.target, grasps,
-                options, start=here, seed=seed, on_step=lambda step: tell(f"{step.stage}: {step.note}"),
+                options, start=here, seed=seed, on_step=lambda step: tell(f"simulating the pick: {step.stage} is done"),
                 watch=watch,
             )  # fmt: skip
     folder = out if out is not None else Path("runs") / "pick"
