@@ -11,8 +11,8 @@ import numpy as np
 from splatbot.errors import InputError
 from splatbot.geometry import inverse, quat_to_rotation, transform_points
 from splatbot.grasping.affordance import Target
+from splatbot.grasping.attached import object_spheres
 from splatbot.grasping.pick import Picker
-from splatbot.grasping.pick_planner import target_spheres
 from splatbot.grasping.pick_types import PickOptions, PickResult, PickStage, PickStep
 from splatbot.grasping.sampler import GraspSampler
 from splatbot.grasping.types import GraspResult
@@ -86,7 +86,7 @@ class MapPick:
 
     @property
     def problems(self) -> tuple[str, ...]:
-        """The reasons for which the pick should not be executed; empty if it should."""
+        """Return the reasons for which the pick should not be executed; empty if it should."""
         found = [] if self.result else [f"{self.result.outcome}: {self.result.reason}"]
         found += [
             f"{contact.part} touches {contact.other} at {contact.first:.2f} s, {1e3 * contact.depth:.1f} mm deep"
@@ -100,53 +100,63 @@ class MapPick:
         return not self.problems
 
 
+def twin_of_pick(scene: Scene, robot: RobotModel, sampler: GraspSampler, target: Target, *, seed: int = 0) -> Twin:
+    """Build the twin of a map in which the target is a movable object: ellipsoids on its completed surface.
+
+    Args:
+        scene: the map in the frame of the robot's base; see :func:`splatbot.sim.maps.placed.placed_scene`.
+        robot: the arm.
+        sampler: of the map.
+        target: the target.
+        seed: of small displacements of the target; 0 for none.
+
+    Raises:
+        InputError: the scene has no map.
+    """
+    if scene.map is None:
+        raise InputError("has no map.", field=scene.name, hint="give the scene of a map")
+    twin = Twin(_with_target(scene, scene.map, sampler, target), robot=robot, seed=seed)
+    _detach_target(twin)
+    return twin
+
+
 def pick_on_map(
-    scene: Scene,
-    robot: RobotModel,
+    twin: Twin,
     sampler: GraspSampler,
     target: Target,
     grasps: GraspResult,
     options: PickOptions,
     *,
     start: Array,
-    seed: int = 0,
     on_step: Callable[[PickStep], None] | None = None,
-    watch: Callable[[World], Callable[[Any, float], None]] | None = None,
+    watch: Callable[[Any, float], None] | None = None,
 ) -> MapPick:
     """Plan a pick on a map, and execute it in the twin of that map.
 
-    1. The target becomes a movable object of the twin: ellipsoids on its completed surface. The rest of the map is
-       fixed.
-    2. :class:`splatbot.grasping.pick.Picker` plans, certifies and executes the pick, as on a robot.
-    3. The target rests as in the map until the fingers press on it, because the frames show it at rest. From then on
+    1. :class:`splatbot.grasping.pick.Picker` plans, certifies and executes the pick, as on a robot.
+    2. The target rests as in the map until the fingers press on it, because the frames show it at rest. From then on
        only friction holds it.
-    4. Contacts and clearance of the arm, and the height of the target, are measured in physics.
+    3. Contacts and clearance of the arm, and the height of the target, are measured in physics.
 
     Args:
-        scene: the map in the frame of the robot's base; see :func:`splatbot.sim.maps.placed.placed_scene`.
-        robot: the arm.
+        twin: from :func:`twin_of_pick`.
         sampler: of the map; its certified margins and obstacles apply.
         target: the target.
         grasps: grasps of it, best first.
         options: of the pick.
         start: (J,) configuration at which the pick begins [rad or m].
-        seed: of small displacements of the target in the twin; 0 for none.
         on_step: called after each stage.
-        watch: returns a further callback for the compiled world, as a video.
+        watch: called with MuJoCo's data and the time [s] after every control period, as a video.
 
     Raises:
-        InputError: the robot has no fingers, or the scene has no map.
+        InputError: the robot has no fingers.
     """
-    if scene.map is None:
-        raise InputError("has no map.", field=scene.name, hint="give the scene of a map")
-    twin = Twin(_with_target(scene, scene.map, sampler, target), robot=robot, seed=seed)
-    _detach_target(twin)
     held = _HeldStill(twin)
     twin.reset(start)
-    monitor = _Monitor(twin, watch(twin.world) if watch is not None else None)
+    monitor = _Monitor(twin, watch)
     controller = TwinController(twin, watch=monitor)
     if controller.gripper is None:
-        raise InputError("has no fingers.", field=robot.name, hint="take a robot with a gripper")
+        raise InputError("has no fingers.", field=twin.scene.name, hint="take a robot with a gripper")
 
     def after(step: PickStep) -> None:
         if step.stage is PickStage.APPROACH:
@@ -157,13 +167,13 @@ def pick_on_map(
         if on_step is not None:
             on_step(step)
 
-    before = float(twin.data.body(OBJECT + TARGET).xipos[2])
+    body = twin.data.body(OBJECT + TARGET)
+    before = float(body.xipos[2])
     picker = Picker(sampler, controller, controller.gripper, options=options, on_step=after)
     result = picker.pick(target, grasps=grasps)
-    rose = float(twin.data.body(OBJECT + TARGET).xipos[2]) - before
     return MapPick(
         result,
-        rose,
+        float(body.xipos[2]) - before,
         options.lift,
         monitor.unintended(),
         monitor.clearance.minimum,
@@ -219,7 +229,8 @@ def hand_parts(world: World) -> frozenset[str]:
 def _with_target(scene: Scene, clutter: Clutter, sampler: GraspSampler, target: Target) -> Scene:
     """Replace the target's Gaussians in a scene by a movable object."""
     T_base_world = inverse(sampler.scene.T_world_base)
-    surface, balls = sampler.surface(target), target_spheres(sampler, target)
+    surface = sampler.surface(target)
+    balls = object_spheres(surface)
     points = transform_points(T_base_world, surface.points)
     parts = solid_shell(points, surface.normals @ T_base_world[:3, :3].T)
     middle = points.mean(axis=0)

@@ -115,7 +115,7 @@ def _stack_map(
         reach = SolidReach(robot, scene.T_world_base, world, target.rows)
         observers = points + CONSTANTS.observer_distance * normals
         sampler = GraspSampler(
-            scene, robot, observers=observers, views=scan.views, make_reach=lambda around, whole: reach
+            scene, robot, observers=observers, views=scan.views, make_reach=lambda around, around_held, whole: reach
         )
         return sampler, SolidPickPlanner(sampler, target, OPTIONS, world)
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from splatbot.cli.paths import check_file, check_output
-from splatbot.cli.placing import Pose, base_pose, map_obstacles, margin_value, run_folder
+from splatbot.cli.placing import Pose, agree_with_plans, base_pose, margin_value, run_folder
 from splatbot.errors import InputError, SplatbotError
 from splatbot.layouts import map_file
 
@@ -17,12 +17,10 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from splatbot.collision.unknown import UnknownPolicy
     from splatbot.grasping.affordance import Hint, ObservedView, Target
     from splatbot.grasping.sampler import GraspSampler
     from splatbot.grasping.types import GraspResult
     from splatbot.robots.graspable_objects import GraspableObjects
-    from splatbot.robots.robot import RobotModel
 
 
 def grasp(
@@ -147,7 +145,7 @@ def grasp(
         margin_text = _set_margin(sampler, "0" if hand_only and margin is None else margin, map, found)
         if not hand_only:
             tell("collecting the obstacles of plans")
-            _agree_with_plans(sampler, map, arm, unknown)
+            agree_with_plans(sampler, map, arm, arm.home, unknown)
         tell(f"searching for grasps of {found.label}")
         result = objects.with_notes(sampler.sample(found, options))
     folder = out if out is not None else Path("runs") / "grasp"
@@ -276,18 +274,6 @@ def _set_margin(sampler: GraspSampler, margin: str | None, map_: Path, target: T
     if sampler.margin > 0.0:
         return f"{1e3 * sampler.margin:.1f} mm for arm and hand; {hand}"
     return f"0, so that errors of the map are not covered; {hand}"
-
-
-def _agree_with_plans(sampler: GraspSampler, map_: Path, arm: RobotModel, policy: UnknownPolicy) -> None:
-    """Limit the pre-grasps to ends of plans from home; for errors see :func:`splatbot.cli.placing.map_obstacles`."""
-    from splatbot.collision import GaussianCollisionField, RobotSpheres
-    from splatbot.gaussians import GaussianModel
-
-    model, most = GaussianModel.load(map_file(map_)), max(sampler.margin, sampler.arm_margin)
-    field = GaussianCollisionField(model, min_observations=sampler.min_observations)
-    spheres = RobotSpheres(arm, T_world_base=sampler.scene.T_world_base)
-    around = map_obstacles(map_, field, model, spheres, arm.home, unknown=policy)
-    sampler.agree_with_plans(around.field(most), around.unknown_field(most))
 
 
 def _print(result: GraspResult, folder: Path, margin: str, *, verbose: bool) -> None:

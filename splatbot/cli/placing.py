@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     import numpy as np
-    from numpy.typing import NDArray
+    from numpy.typing import ArrayLike, NDArray
 
     from splatbot.collision import GaussianCollisionField, RobotSpheres
     from splatbot.collision.unknown import UnknownPolicy
     from splatbot.gaussians import GaussianModel
+    from splatbot.grasping.sampler import GraspSampler
     from splatbot.results.folder import RunFolder
     from splatbot.results.plan_obstacles import PlanObstacles
     from splatbot.robots.robot import RobotModel
@@ -118,6 +119,23 @@ def map_obstacles(
     known = find_workspace(map_) if support else None
     plane = None if known is None else known.support_plane
     return PlanObstacles(field, model, arm, start, plane=plane, space=space, policy=unknown)
+
+
+def agree_with_plans(
+    sampler: GraspSampler, map_: Path, robot: RobotModel, start: ArrayLike, policy: UnknownPolicy
+) -> None:
+    """Limit the pre-grasps of a sampler to ends of plans from ``start`` (J,); for errors see :func:`map_obstacles`."""
+    import numpy as np
+
+    from splatbot.collision import GaussianCollisionField, RobotSpheres
+    from splatbot.gaussians import GaussianModel
+    from splatbot.layouts import map_file
+
+    model, most = GaussianModel.load(map_file(map_)), max(sampler.margin, sampler.arm_margin)
+    field = GaussianCollisionField(model, min_observations=sampler.min_observations)
+    spheres = RobotSpheres(robot, T_world_base=sampler.scene.T_world_base)
+    around = map_obstacles(map_, field, model, spheres, np.asarray(start, dtype=np.float64), unknown=policy)
+    sampler.agree_with_plans(around.field(most), around.unknown_field(most))
 
 
 def joint_values(words: tuple[str, ...], robot: RobotModel, flag: str) -> NDArray[np.float64]:

@@ -178,6 +178,7 @@ def plan(
     of_arm = (appearance(arm), arm.fk, arm.T_link_tcp)
     picture = plan_png(model, found.planner.arm, trajectory, *of_arm, nearest=nearest)
     replace_files(folder, writers | {"plan.png": write_bytes(picture)})
+    (folder / "refused.png").unlink(missing_ok=True)  # of an earlier plan
     _print(result, trajectory, covers, nearest, folder)
     if grasp is not None:
         print_text("the approach to the grasp is not part of this plan; see `splatbot plan-pick` for the whole pick")

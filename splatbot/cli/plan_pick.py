@@ -3,28 +3,22 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from splatbot.cli.drawing import draw_offscreen
+from splatbot.cli.drawing import CAMERA, draw_offscreen, film
 from splatbot.cli.grasp import graspable_objects
 from splatbot.cli.paths import check_file, check_output
-from splatbot.cli.placing import Pose, joint_values, map_obstacles, pose_values
+from splatbot.cli.placing import Pose, agree_with_plans, joint_values, pose_values
 from splatbot.errors import SplatbotError
 from splatbot.layouts import map_file
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from splatbot.grasping.grasp_file import GraspFile
-    from splatbot.grasping.sampler import GraspSampler
-    from splatbot.robots.robot import RobotModel
     from splatbot.sim.map_pick import MapPick
+    from splatbot.sim.scene import Scene
 
 
 def plan_pick(
@@ -83,7 +77,7 @@ def plan_pick(
     from splatbot.grasping.grasp_file import GraspFile
     from splatbot.grasping.pick_types import PickOptions
     from splatbot.robots.store import load_robot
-    from splatbot.sim.map_pick import pick_on_map
+    from splatbot.sim.map_pick import pick_on_map, twin_of_pick
     from splatbot.sim.page import recording_html
 
     options = PickOptions(
@@ -93,28 +87,33 @@ def plan_pick(
     robot = load_robot(known.robot)
     grasps = known.result(grasp_index, len(robot))
     here = joint_values(start, robot, "--start")
+    known.check_map(file)
     with steps() as tell:
         tell("segmenting the objects of the map")
         objects = graspable_objects(map, _base(map, known))
-        known.check_map(file, len(objects.scene.model))
+        known.check_rows(len(objects.scene.model))
         sampler = objects.sampler(robot, n_sigma=known.n_sigma, min_observations=known.min_observations)
         sampler.margin, sampler.arm_margin = known.margin, known.arm_margin
         tell("collecting the obstacles of plans")
-        _agree_with_plans(sampler, map, robot, known, here)
+        agree_with_plans(sampler, map, robot, here, known.unknown)
         tell("planning and simulating the pick")
-        with _film(video) as watch:
+        scene = _scene(map, known, with_camera=video is not None)
+        twin = twin_of_pick(scene, robot, sampler, known.target, seed=seed)
+        with film(video, twin.world, seed) as watch:
             picked = pick_on_map(
-                _scene(map, known, with_camera=video is not None), robot, sampler, known.target, grasps,
-                options, start=here, seed=seed, on_step=lambda step: tell(f"simulating the pick: {step.stage} is done"),
-                watch=watch,
+                twin, sampler, known.target, grasps, options, start=here,
+                on_step=lambda step: tell(f"simulating the pick: {step.stage} is done"), watch=watch,
             )  # fmt: skip
     folder = out if out is not None else Path("runs") / "pick"
     texts = {"pick.json": json.dumps(_summary(picked, known), indent=2)}
     for name, motion in zip(_names(picked), picked.result.motions, strict=True):
         texts[name] = motion.trajectory.to_json()
     title = f"{known.target.label} in {map.resolve().name}"
-    texts["pick.html"] = recording_html(picked.recording, title=title, facts=f"simulated: {_verdict(picked)}")
+    texts["pick.html"] = recording_html(picked.recording, title=title, facts=f"in simulation: {_verdict(picked)}")
     replace_files(folder, {name: write_text(text) for name, text in texts.items()})
+    for path in folder.glob("[0-9]-*.json"):
+        if path.name not in texts:  # a motion of an earlier pick must not follow these
+            path.unlink()
     _print(picked, known, folder)
     if not picked:
         first = picked.problems[0].split("; ")[0].rstrip(".")  # the table has all of them
@@ -140,47 +139,14 @@ def _base(map_: Path, known: GraspFile) -> Pose | None:
     return (x, y, z, *pose["quaternion_wxyz"])  # type: ignore[return-value]
 
 
-def _agree_with_plans(
-    sampler: GraspSampler, map_: Path, robot: RobotModel, known: GraspFile, start: NDArray[np.float64]
-) -> None:
-    """Set the obstacles of plans that begin at ``start`` (J,); see :func:`splatbot.cli.placing.map_obstacles`."""
-    from splatbot.collision import GaussianCollisionField, RobotSpheres
-    from splatbot.gaussians import GaussianModel
-
-    model, most = GaussianModel.load(map_file(map_)), max(sampler.margin, sampler.arm_margin)
-    field = GaussianCollisionField(model, min_observations=sampler.min_observations)
-    spheres = RobotSpheres(robot, T_world_base=sampler.scene.T_world_base)
-    around = map_obstacles(map_, field, model, spheres, start, unknown=known.unknown)
-    sampler.agree_with_plans(around.field(most), around.unknown_field(most))
-
-
-def _scene(map_: Path, known: GraspFile, *, with_camera: bool) -> Any:
+def _scene(map_: Path, known: GraspFile, *, with_camera: bool) -> Scene:
     from splatbot.sim.maps.placed import placed_scene
     from splatbot.sim.scene import make_scene
 
     values = placed_scene(map_, T_world_base=known.T_world_base)
     if with_camera:
-        values["camera"] = {"at": [1.5, -0.9, 0.9], "look_at": [0.35, 0.0, 0.25], "width": 640, "height": 480}
+        values["camera"] = CAMERA
     return make_scene(values)
-
-
-@contextmanager
-def _film(path: Path | None) -> Iterator[Callable[[Any], Any] | None]:
-    if path is None:
-        yield None
-        return
-    from splatbot.sim.camera import TwinCamera
-    from splatbot.sim.dressing import dressed
-    from splatbot.sim.video import Video
-
-    with ExitStack() as stack:
-
-        def watch(world: Any) -> Video:
-            video = Video(path, TwinCamera(dressed(world)))
-            stack.callback(video.close)
-            return video
-
-        yield watch
 
 
 def _names(picked: MapPick) -> list[str]:
@@ -240,11 +206,9 @@ def _print(picked: MapPick, known: GraspFile, folder: Path) -> None:
         clearance = clearance_text(motion.trajectory.certificate)
         rows.append((name.removesuffix(".json"), f"{length}, {opening}, clearance {clearance}"))
     rows.append(("margin", f"{1e3 * known.arm_margin:.1f} mm before the hand, {1e3 * known.margin:.1f} mm at the hand"))
-    rows.append(("simulated", _verdict(picked)))
+    rows.append(("verdict", _verdict(picked)))
     if near.part:
         where = f"{near.part} and {near.other} at {near.time:.1f} s"
         rows.append(("nearest in the twin", f"{1e3 * near.value:.1f} mm, {where}; without the hand"))
     print_table([*rows, ("written to", str(folder))], title=f"pick of {known.target.label}")
-    print_text(
-        "the twin assumes a mass of 0.2 kg and the friction of its table; the shape of the target is the completed one"
-    )
+    print_text("the twin assumes 0.2 kg, a friction coefficient of 0.8, and the completed shape of the target")

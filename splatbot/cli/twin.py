@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from splatbot.cli.drawing import draw_offscreen
+from splatbot.cli.drawing import CAMERA, draw_offscreen, film
 from splatbot.cli.paths import check_file, check_output
 from splatbot.cli.placing import Pose, checked_pose
 from splatbot.errors import InputError
@@ -99,10 +99,10 @@ def twin(
     motion = None
     if trajectory is not None and it.world.robot is not None:
         motion = load_motion(trajectory, it.world.robot)
-    with _film(video, it.world, seed) as film, _progress(quiet) as show:
+    with film(video, it.world, seed) as shown, _progress(quiet) as show:
         recording = TwinRecording(it.world) if html is not None else None
-        result = it.follow(motion, progress=show, watch=_watchers(film, recording))
-        sensor = film.report() if film is not None else []
+        result = it.follow(motion, progress=show, watch=_watchers(shown, recording))
+        sensor = shown.report() if shown is not None else []
     entries = ledger(it, result, motion, costs=not no_costs, sensor=sensor)
     if json is not None:
         _write(json, result, entries, sensor)
@@ -127,7 +127,7 @@ def _scene(name: str | None, map: Path | None, base: Pose | None, *, with_camera
             return found
         values = found.model_dump() | {"folder": found.folder}
     if with_camera:
-        values["camera"] = {"at": [1.5, -0.9, 0.9], "look_at": [0.35, 0.0, 0.25], "width": 640, "height": 480}
+        values["camera"] = CAMERA
     return make_scene(values)
 
 
@@ -135,22 +135,6 @@ def _harm(scene: Scene, result: TwinResult) -> bool:
     """Return whether the arm had an unintended contact, or the simulation was unstable."""
     may_touch = scene.task.kind in ("push", "grasp", "hang", "wipe", "squeeze")
     return bool((result.contacts and not may_touch) or any("unstable" in text for text in result.warnings))
-
-
-@contextmanager
-def _film(path: Path | None, world: Any, seed: int) -> Iterator[Any]:
-    if path is None:
-        yield None
-        return
-    from splatbot.sim.camera import TwinCamera
-    from splatbot.sim.dressing import dressed
-    from splatbot.sim.video import Video
-
-    video = Video(path, TwinCamera(dressed(world), seed=seed))
-    try:
-        yield video
-    finally:
-        video.close()
 
 
 def _watchers(*watchers: Callable[[Any, float], None] | None) -> Callable[[Any, float], None] | None:

@@ -21,6 +21,7 @@ from splatbot.grasping.types import Grasp, GraspResult
 from splatbot.protocols import Array
 
 _HINT = "give the grasp.json of `splatbot grasp`"
+_AGAIN = "search for grasps again, in this map"
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +33,7 @@ class GraspFile:
         robot: name of the robot.
         T_world_base: (4, 4) pose of its base [m].
         target: the target; its rows are those of the map without flying pixels.
+        gaussians: number of rows of that map.
         grasps: grasps, best first.
         margin, arm_margin: clearance [m] of the whole arm, and of the links before the hand.
         unknown: treatment of unknown space.
@@ -44,6 +46,7 @@ class GraspFile:
     robot: str
     T_world_base: Array
     target: Target
+    gaussians: int
     grasps: tuple[Grasp, ...]
     margin: float
     arm_margin: float
@@ -67,6 +70,9 @@ class GraspFile:
     @classmethod
     def _from(cls, path: Path, values: Mapping[str, Any]) -> GraspFile:
         base, target = values["T_world_base"], values["target"]
+        rows, gaussians = np.array(values["target_rows"], dtype=np.int64), int(values["map_gaussians"])
+        if rows.ndim != 1 or not len(rows) or rows.min() < 0 or rows.max() >= gaussians:
+            raise ValueError(f"target_rows are no rows of {gaussians} Gaussians")
         if values["unknown_space"] not in ("free", "cautious", "occupied"):
             raise ValueError(f"unknown_space is {values['unknown_space']!r}")
         return cls(
@@ -74,12 +80,13 @@ class GraspFile:
             robot=str(values["robot"]),
             T_world_base=pose_from_quat(base["translation"], base["quaternion_wxyz"]),
             target=Target(
-                np.array(values["target_rows"], dtype=np.int64),
+                rows,
                 None,
                 str(target["label"]),
                 str(target["backend"]),
                 float(target["score"]),
             ),
+            gaussians=gaussians,
             grasps=tuple(grasp_from(grasp) for grasp in values["grasps"]),
             margin=float(values["margin_m"]),
             arm_margin=float(values["arm_margin_m"]),
@@ -102,15 +109,24 @@ class GraspFile:
             hint = "give the --base of the grasps"
             raise InputError("is another base.", file=self.path, field="T_world_base", hint=hint)
 
-    def check_map(self, file: Path, rows: int) -> None:
-        """Check that the grasps are of a map's file, which has this number of rows without flying pixels.
+    def check_map(self, file: Path) -> None:
+        """Check that the grasps are of a map's file.
 
         Raises:
             InputError: the map is another one, or it changed since.
         """
-        if self.map_sha256 != sha256(file) or self.target.rows.max(initial=-1) >= rows:
-            hint = "search for grasps again, in this map"
-            raise InputError("is of another map, or the map changed.", file=self.path, field="map_sha256", hint=hint)
+        if self.map_sha256 != sha256(file):
+            raise InputError("is of another map, or the map changed.", file=self.path, field="map_sha256", hint=_AGAIN)
+
+    def check_rows(self, gaussians: int) -> None:
+        """Check the number of Gaussians without flying pixels, to which the rows of the target refer.
+
+        Raises:
+            InputError: it differs, as after the recording of the run became unreadable.
+        """
+        if self.gaussians != gaussians:
+            text = f"are of {self.gaussians} Gaussians without flying pixels; there are {gaussians} now."
+            raise InputError(text, file=self.path, field="target_rows", hint=_AGAIN)
 
     def grasp(self, index: int, joints: int) -> Grasp:
         """Return the grasp of a rank, from 0, of a robot with this number of joints.
@@ -157,6 +173,7 @@ def grasp_file(
         "n_sigma": sampler.n_sigma,
         "min_observations": sampler.min_observations,
         "map_sha256": sha256(map_file),
+        "map_gaussians": len(sampler.scene.model),
         "target_rows": result.target.rows.tolist(),
     }
 

@@ -161,7 +161,7 @@ class _Pick:
                     raise
                 self._done(f"{miss.outcome}: {miss.reason}; the next grasp is tried")
                 if miss.back is not None:
-                    self._follow(PickStage.APPROACH, miss.back, self.o.slow)
+                    self._follow(PickStage.APPROACH, miss.back, self.o.slow, plan.opening)
 
     def _plan(self) -> PickPlan:
         """Plan to the grasps in order of their score, and return the first plan that is found; the rest is left."""
@@ -202,13 +202,13 @@ class _Pick:
         self.gripper.move(plan.opening)
         self._settle()
         self._done(f"{1e3 * self.gripper.opening():.0f} mm")
-        self._follow(PickStage.MOVE, plan.to_pregrasp, 1.0)
+        self._follow(PickStage.MOVE, plan.to_pregrasp, 1.0, plan.opening)
         if self.p.camera is not None:
             plan = self._look(self.p.camera, plan)
-        self._follow(PickStage.APPROACH, plan.approach, self.o.slow)
+        self._follow(PickStage.APPROACH, plan.approach, self.o.slow, plan.opening)
         self._close(plan)
-        self._follow(PickStage.LIFT, plan.lift_off, self.o.slow)
-        self._follow(PickStage.LIFT, plan.lift, self.o.slow)
+        self._follow(PickStage.LIFT, plan.lift_off, self.o.slow, plan.grasp.width)
+        self._follow(PickStage.LIFT, plan.lift, self.o.slow, plan.grasp.width)
         self._check(plan)
         if self.o.carry_to is not None:
             self._carry(plan)
@@ -251,7 +251,7 @@ class _Pick:
             raise _MissedError(PickOutcome.NO_PLAN, adjusted)
         self.s, self.planner, self.grasp = adjusted.sampler, adjusted.planner, adjusted.plan.grasp
         self.T_now_mapped = T_now_before @ self.T_now_mapped
-        self._follow(PickStage.ADJUST, adjusted.plan.to_pregrasp, self.o.slow)
+        self._follow(PickStage.ADJUST, adjusted.plan.to_pregrasp, self.o.slow, plan.opening)
         return adjusted.plan
 
     def _close(self, plan: PickPlan) -> None:
@@ -302,12 +302,12 @@ class _Pick:
         if not isinstance(segment, Segment):
             raise _EndedError(PickOutcome.NO_PLAN, segment)
         self._note_moving(segment)
-        self._follow(PickStage.CARRY, segment, self.o.slow)
+        self._follow(PickStage.CARRY, segment, self.o.slow, plan.grasp.width)
         if not self.gripper.holds():
             self.attached = None
             raise _EndedError(PickOutcome.LOST, "the object is no longer between the fingers")
 
-    def _follow(self, stage: PickStage, segment: Segment, factor: float) -> None:
+    def _follow(self, stage: PickStage, segment: Segment, factor: float, opening: float) -> None:
         self.stage = stage
         scale = self.o.speed * factor
         trajectory = time_path(
@@ -318,7 +318,7 @@ class _Pick:
         motion = certify_motion(trajectory, segment.arm, segment.around)
         for guard in segment.guards:
             certify_motion(trajectory, guard.links, guard.field)
-        self.motions.append(PickMotion(stage, trajectory, self.gripper.opening()))
+        self.motions.append(PickMotion(stage, trajectory, opening))
         done = follow(self.controller, motion, stop=self._stop_requested)
         self.q = trajectory.end
         if done.state is MotionState.STOPPED and self._stop_requested(None):

@@ -179,21 +179,22 @@ class MapPickPlanner:
         lift = self._up(loaded, obstacles.around_held, lift_off.path.waypoints[-1], self.o.lift - self.o.lift_off)
         if not lift or lift.path is None:
             return f"it cannot be lifted: with the object in the hand, {lift.reason.rstrip('.')}"
-        to_pregrasp = Segment(plan.path, planner.arm, obstacles.whole, avoids_moving)
-        straight = [
-            Segment(path, arm, field, avoids_moving, self._guards(field))
-            for path, arm, field in (
-                (approach.path, hand, obstacles.around),
-                (lift_off.path, closed, obstacles.around_held),
-                (lift.path, loaded, obstacles.around_held),
-            )
-        ]
-        for segment in straight:
+        guards, guards_held = self._guards(obstacles.around), self._guards(obstacles.around_held)
+        found = PickPlan(
+            grasp,
+            opening,
+            attached,
+            to_pregrasp=Segment(plan.path, planner.arm, obstacles.whole, avoids_moving),
+            approach=Segment(approach.path, hand, obstacles.around, avoids_moving, guards),
+            lift_off=Segment(lift_off.path, closed, obstacles.around_held, avoids_moving, guards_held),
+            lift=Segment(lift.path, loaded, obstacles.around_held, avoids_moving, guards_held),
+            planning_seconds=planning_seconds,
+        )
+        for segment in (found.approach, found.lift_off, found.lift):
             for guard in segment.guards:
                 if guard.meets(segment.path.waypoints):
                     return guard.reason
-        approach_, lift_off_, lift_ = straight
-        return PickPlan(grasp, opening, attached, to_pregrasp, approach_, lift_off_, lift_, planning_seconds)
+        return found
 
     def plan_carry(self, plan: PickPlan, start: Array, goal: JointGoal) -> Segment | str:
         """Plan a path with the attached object, if possible around the regions where motion was observed."""
@@ -259,8 +260,9 @@ class MapPickPlanner:
     def _guards(self, field: GaussianCollisionField) -> tuple[LinkGuard, ...]:
         if self.s.departure is None:
             return ()
-        margins = {"margin": self.s.margin, "arm_margin": self.s.arm_margin}
-        return link_guards(self.s.robot, self._T, field, unknown=self.s.unknown, **margins)
+        return link_guards(
+            self.s.robot, self._T, field, margin=self.s.margin, arm_margin=self.s.arm_margin, unknown=self.s.unknown
+        )
 
     def _up(self, arm: RobotSpheres, field: GaussianCollisionField, q: Array, height: float) -> StraightResult:
         return straight_line(arm, field, q, raised(self.s, arm, q, height))

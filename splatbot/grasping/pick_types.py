@@ -118,7 +118,7 @@ class PickMotion:
     Args:
         stage: its stage.
         trajectory: the certified trajectory.
-        opening: finger opening during it [m].
+        opening: finger opening with which it is certified [m].
     """
 
     stage: PickStage

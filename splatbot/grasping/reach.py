@@ -77,7 +77,7 @@ class LinkGuard:
 
     @property
     def reason(self) -> str:
-        """One clause that describes a path on which a link comes too near."""
+        """Describe a path on which a link comes too near, as a clause."""
         return f"the arm comes within {1e3 * self.links.margin:.1f} mm of {self.obstacle} on its approach"
 
 
@@ -136,15 +136,14 @@ class ArmReach:
         T_world_base: (4, 4) pose of its base.
         around: field of the map without the target; the whole approach is certified against it.
         whole: field of the whole map, of which the arm must be free at the pre-grasp. If None, this is not checked.
+        around_held: field that the closed fingers avoid, ``around`` without strays inside of the target. If None, it is
+            ``around``.
         margin: clearance that arm and hand keep from the map [m].
         arm_margin: the same for the links before the hand alone [m].
         departure: field of the plan to the pre-grasp. There the robot, with its hand fully open, keeps both margins
             from it. If None, this is not checked.
         unknown: field of unknown space. The links before the hand keep both margins from it on the whole approach.
         seed: seed of inverse kinematics.
-
-    Attributes:
-        around_held: field that the closed fingers avoid: ``around``, or the same without strays inside of the target.
     """
 
     def __init__(
@@ -154,6 +153,7 @@ class ArmReach:
         around: GaussianCollisionField,
         whole: GaussianCollisionField | None = None,
         *,
+        around_held: GaussianCollisionField | None = None,
         margin: float = 0.0,
         arm_margin: float = 0.0,
         departure: GaussianCollisionField | None = None,
@@ -164,7 +164,7 @@ class ArmReach:
             if not 0.0 <= value < np.inf:
                 raise InputError(f"is {value}.", field=name, hint="give metres, 0 or more")
         self.robot, self.around, self.whole, self.seed = robot, around, whole, seed
-        self.around_held = around
+        self.around_held = around if around_held is None else around_held
         self.departure = departure
         stroke = hand_of(robot).stroke
 

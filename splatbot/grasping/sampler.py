@@ -22,7 +22,7 @@ from splatbot.grasping.types import GraspResult
 from splatbot.protocols import Array, RobotKinematics
 from splatbot.segmentation import SegmentedMap
 
-MakeReach = Callable[[GaussianCollisionField, GaussianCollisionField], ReachabilityCheck]
+MakeReach = Callable[[GaussianCollisionField, GaussianCollisionField, GaussianCollisionField], ReachabilityCheck]
 
 
 class GraspSampler:
@@ -32,7 +32,8 @@ class GraspSampler:
         scene: segmented map; its base frame is that of the robot.
         robot: robot with fingers.
         hand_only: check only the hand, not whether an arm reaches the grasp.
-        make_reach: returns the reachability check for the map without the target and the whole map. If None,
+        make_reach: returns the reachability check for the map without the target, the same without strays inside of the
+            target, and the whole map. If None,
             :class:`splatbot.grasping.reach.ArmReach` is used.
         observers: (N, 3) camera centre from which each Gaussian was observed [m, world], NaN where unknown. If None,
             all are unknown.
@@ -121,19 +122,14 @@ class GraspSampler:
             model = with_balls(model, self.moving, n_sigma=self.n_sigma, observations=self.min_observations)
         return GaussianCollisionField(model, self.n_sigma, min_observations=self.min_observations)
 
-    def reach(
-        self, around: GaussianCollisionField, around_held: GaussianCollisionField | None = None
-    ) -> ReachabilityCheck | None:
+    def reach(self, around: GaussianCollisionField, around_held: GaussianCollisionField) -> ReachabilityCheck | None:
         """Return the reachability check against the map without the target; None if only the hand is checked.
 
-        The closed fingers are checked against ``around_held``, by default the same.
+        Args:
+            around: field of the map without the target.
+            around_held: the same without strays inside of the target, which the closed fingers avoid.
         """
-        if self._make_reach is None:
-            return None
-        found = self._make_reach(around, self.field)
-        if around_held is not None and isinstance(found, ArmReach):
-            found.around_held = around_held
-        return found
+        return None if self._make_reach is None else self._make_reach(around, around_held, self.field)
 
     def reach_avoiding_moving(self, around: GaussianModel) -> ReachabilityCheck | None:
         """Return the reachability check that also avoids the regions where motion was observed.
@@ -142,15 +138,18 @@ class GraspSampler:
         """
         if self._make_reach is None or self.moving is None:
             return None
-        fields = (self.collision_field(model, avoid_moving=True) for model in (around, self.scene.model))
-        return self._make_reach(*fields)
+        without, whole = (self.collision_field(model, avoid_moving=True) for model in (around, self.scene.model))
+        return self._make_reach(without, without, whole)
 
-    def _arm_reach(self, around: GaussianCollisionField, whole: GaussianCollisionField) -> ReachabilityCheck:
+    def _arm_reach(
+        self, around: GaussianCollisionField, around_held: GaussianCollisionField, whole: GaussianCollisionField
+    ) -> ReachabilityCheck:
         return ArmReach(
             self.robot,
             self.scene.T_world_base,
             around,
             whole,
+            around_held=around_held,
             margin=self.margin,
             arm_margin=self.arm_margin,
             departure=self.departure,

@@ -135,15 +135,8 @@ def plan_png(
     """
     times = np.linspace(0.0, trajectory.duration, CONSTANTS.ghosts)
     near = _within(model, inverse(arm.T_world_base))
-    camera = Camera(0.9 * width, 0.9 * width, (width - 1) / 2, (width * 3 // 4 - 1) / 2, width, width * 3 // 4)
     moments = trajectory.at(np.linspace(0.0, trajectory.duration, CONSTANTS.frames)).position
-    swept = arm.centers(moments)
-    points = transform_points(inverse(arm.T_world_base), swept.reshape(-1, 3))
-    middle = (points.min(axis=0) + points.max(axis=0)) / 2
-    radius = float(np.linalg.norm(points - middle, axis=1).max())
-    away = radius / np.sin(np.arctan2(camera.height / 2, camera.fy)) + 1e-6
-    eye = middle + away * _FROM / np.linalg.norm(_FROM)
-    T_world_camera = arm.T_world_base @ look_at(eye, middle)
+    camera, T_world_camera, away = _framed(arm, moments, width)
     tool = (arm.T_world_base @ fk(moments)[:, -1] @ T_link_tcp)[:, :3, 3]
     drawn = [model.select(torch.from_numpy(near)), _dots(tool, 0.004, _TOOL)]
     legend = [("arm at the start", _START_SHADE), ("arm at the goal", _END_SHADE), ("path of the tool", _TOOL)]
@@ -166,8 +159,7 @@ def plan_png(
             opacity=1.0 if k in (0, last) else 0.3,
         )
     if nearest is not None:
-        x, y, z = transform_points(inverse(T_world_camera), nearest.point)
-        view = with_ring(view, (camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy), _NEAREST)
+        view = _ringed(view, camera, T_world_camera, nearest.point)
     view = with_legend(view, legend)
     return to_png(with_scale(view, camera, away, "at the middle of the picture"), "rgb")
 
@@ -197,11 +189,7 @@ def refused_png(
         solids: obstacles that are not in the map. Those near the place are drawn in violet.
         width: of the image [px]; the height is 3/4 of it.
     """
-    camera = Camera(0.9 * width, 0.9 * width, (width - 1) / 2, (width * 3 // 4 - 1) / 2, width, width * 3 // 4)
-    points = transform_points(inverse(arm.T_world_base), arm.centers(q[None])[0])
-    middle = (points.min(axis=0) + points.max(axis=0)) / 2
-    away = float(np.linalg.norm(points - middle, axis=1).max()) / np.sin(np.arctan2(camera.height / 2, camera.fy))
-    T_world_camera = arm.T_world_base @ look_at(middle + away * _FROM / np.linalg.norm(_FROM), middle)
+    camera, T_world_camera, away = _framed(arm, q[None], width)
     at = transform_points(arm.T_world_base, point[None])[0]
     drawn = [model.select(torch.from_numpy(_within(model, inverse(arm.T_world_base))))]
     legend = [("arm at the refused configuration", _END_SHADE), (reason, _NEAREST)]
@@ -214,9 +202,24 @@ def refused_png(
     draw_robot(
         view, depth, camera, T_world_camera, parts, arm.T_world_base @ fk(q[None])[0], tint=_END_SHADE, opacity=0.8
     )
-    x, y, z = transform_points(inverse(T_world_camera), at[None])[0]
-    view = with_ring(view, (camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy), _NEAREST)
+    view = _ringed(view, camera, T_world_camera, at)
     return to_png(with_scale(with_legend(view, legend), camera, away, "at the middle of the picture"), "rgb")
+
+
+def _framed(arm: RobotSpheres, q: Array, width: int) -> tuple[Camera, Array, float]:
+    """Return a camera that shows the arm at all configurations (K, J), its pose (4, 4) and its distance [m]."""
+    camera = Camera(0.9 * width, 0.9 * width, (width - 1) / 2, (width * 3 // 4 - 1) / 2, width, width * 3 // 4)
+    points = transform_points(inverse(arm.T_world_base), arm.centers(q).reshape(-1, 3))
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    radius = float(np.linalg.norm(points - middle, axis=1).max())
+    away = float(radius / np.sin(np.arctan2(camera.height / 2, camera.fy)) + 1e-6)
+    return camera, arm.T_world_base @ look_at(middle + away * _FROM / np.linalg.norm(_FROM), middle), away
+
+
+def _ringed(view: NDArray[np.float32], camera: Camera, T_world_camera: Array, point: Array) -> NDArray[np.float32]:
+    """Draw a ring at a point (3,) of the world."""
+    x, y, z = transform_points(inverse(T_world_camera), point)
+    return with_ring(view, (camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy), _NEAREST)
 
 
 def _dots(points: Array, radius: float, color: Color) -> GaussianModel:

@@ -52,6 +52,9 @@ def test_the_box_is_held_in_the_twin_and_each_motion_clears_the_true_objects(
     stages = [motion["stage"] for motion in written["motions"]]
     assert stages == ["move", "approach", "lift", "lift"]
     assert all(motion["certified"] for motion in written["motions"])
+    openings = [motion["opening_m"] for motion in written["motions"]]
+    assert openings[:2] == pytest.approx([round(openings[0] / 0.002) * 0.002] * 2, abs=1e-9)  # as certified
+    assert openings[2:] == [written["grasp_width_m"]] * 2
     assert (out / "pick.html").stat().st_size > 100_000
     robot, end = panda(), np.asarray(panda().home)
     for motion in written["motions"]:
@@ -81,9 +84,14 @@ def test_a_pick_that_the_twin_does_not_hold_is_not_to_be_executed(
     best["T_world_tcp"] = best["T_world_pregrasp"] | {"position": [x, y, z - 0.01]}
     grasps.write_text(json.dumps(values))
     out = tmp_path / "out"
+    out.mkdir()
+    (out / "4-lift.json").write_text("of an earlier pick")
     answer = run("plan-pick", "--map", map_file, "--grasp", grasps, "--grasp-index", 0, "--speed", 0.5, "--out", out)
     assert_refused(answer, "should not be executed: nothing held")
-    assert not json.loads((out / "pick.json").read_text())["execute"]
+    written = json.loads((out / "pick.json").read_text())
+    assert not written["execute"]
+    files = {path.name for path in out.glob("[0-9]*")}
+    assert files == {motion["file"] for motion in written["motions"]} == {"1-move.json", "2-approach.json"}
 
 
 def test_grasps_of_a_map_that_changed_are_refused(
@@ -93,6 +101,18 @@ def test_grasps_of_a_map_that_changed_are_refused(
     words = ("--map", map_file, "--grasp", grasps, "--out", tmp_path / "out")
     assert_refused(run("plan-pick", *words), "is of another map, or the map changed")
     assert not (tmp_path / "out").exists()
+
+
+def test_rows_of_another_number_of_gaussians_are_refused(
+    run: RunCommand, map_file: Path, grasps: Path, tmp_path: Path
+) -> None:
+    """Without the recording no flying pixel is removed, and the rows would be those of other Gaussians."""
+    values = json.loads(grasps.read_text())
+    grasps.write_text(json.dumps(values | {"map_gaussians": values["map_gaussians"] + 1}))
+    words = ("--map", map_file, "--grasp", grasps, "--out", tmp_path / "out")
+    assert_refused(run("plan-pick", *words), "Gaussians without flying pixels; there are")
+    grasps.write_text(json.dumps(values | {"target_rows": [-1]}))
+    assert_refused(run("plan-pick", *words), "is no file of grasps")
 
 
 def test_a_rank_that_does_not_exist_is_refused(run: RunCommand, map_file: Path, grasps: Path) -> None:

@@ -47,5 +47,6 @@ def grasp_file_values(*grasps: dict[str, Any], robot: str = "panda") -> dict[str
         "n_sigma": 1.0,
         "min_observations": 1,
         "map_sha256": "0" * 64,
+        "map_gaussians": 10,
         "target_rows": [0, 1, 2],
     }

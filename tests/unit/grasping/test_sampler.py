@@ -159,7 +159,7 @@ class _Nowhere:
 
 
 def test_without_a_reachable_grasp_the_best_is_reported_with_its_reason_and_all_are_counted() -> None:
-    sampler = GraspSampler(scene(), panda(), make_reach=lambda around, whole: _Nowhere())
+    sampler = GraspSampler(scene(), panda(), make_reach=lambda around, around_held, whole: _Nowhere())
     result = sampler.sample(target_of(scene(), BOX, "box"))
     assert not result.grasps
     assert result.best_rejected is not None
@@ -194,7 +194,7 @@ def test_candidates_of_both_searches_are_counted() -> None:
     box = target_of(scene(), BOX, "box")
     once = GraspSampler(scene(), panda(), hand_only=True).sample(box, GraspOptions(samples=100))
     more = _Sharp(scene(), panda(), hand_only=True).sample(box, GraspOptions(samples=400))
-    twice = GraspSampler(scene(), panda(), make_reach=lambda around, whole: _Nowhere()).sample(
+    twice = GraspSampler(scene(), panda(), make_reach=lambda around, around_held, whole: _Nowhere()).sample(
         box, GraspOptions(samples=100)
     )
     assert not twice
