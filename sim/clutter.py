@@ -42,6 +42,8 @@ CONSTANTS = ClutterConstants()
 
 
 _ON_TABLE = -2  # label of segmentation
+REPRESENTED = -3
+"""Label of Gaussians that an object of the scene represents; see :class:`splatbot.sim.scene.Clutter`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +55,8 @@ class MapParts:
         objects: table and fitted objects, as scene objects.
         ellipsoids: the rest.
         notes: description of each part with its geometric error against the map.
-        labels: (N,) of the map's Gaussians: -2 left out, -1 ellipsoids, 0 the table, k the k-th fitted object.
+        labels: (N,) of the map's Gaussians: -3 represented by an object of the scene, -2 left out, -1 ellipsoids, 0 the
+            table, k the k-th fitted object.
     """
 
     model: GaussianModel
@@ -78,9 +81,10 @@ def map_parts(model: GaussianModel, clutter: Clutter, base: Array) -> MapParts:
     R = T_scene_map[:3, :3]
     means = transform_points(T_scene_map, model.means.detach().double().numpy())
     inside = ((means >= clutter.low) & (means <= clutter.high)).all(axis=1)
+    represented = np.zeros(len(means), np.bool_)
     for *center, radius in clutter.without:
-        inside &= np.linalg.norm(means - center, axis=1) > radius
-    used = np.flatnonzero(solid_rows(model) & inside)
+        represented |= np.linalg.norm(means - center, axis=1) <= radius
+    used = np.flatnonzero(solid_rows(model) & inside & ~represented)
     if not len(used):
         raise InputError(
             f"{clutter.file}: none of {len(means)} Gaussians is solid and between {clutter.low} and {clutter.high}.",
@@ -88,6 +92,7 @@ def map_parts(model: GaussianModel, clutter: Clutter, base: Array) -> MapParts:
             hint="name another part by low and high, or place the map by at and rpy",
         )
     labels = np.full(len(means), -2, dtype=np.int32)
+    labels[represented] = REPRESENTED
     labels[used] = -1
     objects: list[SceneObject] = []
     notes: list[str] = []
@@ -190,10 +195,13 @@ def _add_objects(
     notes: list[str],
 ) -> None:
     for obj in scene.objects:
-        points = means[obj.rows[scene.solid[obj.rows]]]
+        rows = obj.rows[labels[obj.rows] != REPRESENTED]
+        points = means[rows[scene.solid[rows]]]
+        if len(rows) < len(obj.rows) and len(points) < SEGMENTATION.min_gaussians:
+            continue  # an object of the scene represents it
         found = fit(points, _floor(scene, points))
         number = len(objects)
-        labels[obj.rows] = number
+        labels[rows] = number
         name = f"map-{found.shape['kind']}-{number}"
         values = {"name": name, "shapes": [found.shape], "at": found.at.tolist(), "movable": clutter.movable}
         objects.append(SceneObject.model_validate(values))

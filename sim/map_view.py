@@ -13,6 +13,7 @@ from splatbot.gaussians import GaussianModel
 from splatbot.geometry import inverse, pose_from_quat, quat_multiply, rotation_to_quat, transform_points
 from splatbot.protocols import Array
 from splatbot.rasterize.views import render_rgbd
+from splatbot.sim.clutter import REPRESENTED
 from splatbot.sim.solids import pose_at
 from splatbot.sim.view import TwinView
 from splatbot.sim.world import OBJECT, World
@@ -32,11 +33,15 @@ class MapView:
         parts = world.parts
         assert parts is not None
         assert world.scene.map is not None
-        self.camera, self._model = camera, parts.model
+        shown = np.flatnonzero(parts.labels != REPRESENTED)
+        self.camera, self._model = camera, parts.model.select(torch.from_numpy(shown))
         self._sh_degree = world.harmonics
         self._T_world_map = pose_at(world.scene.map.at, world.scene.map.rpy)
         self._loose = [
-            (int(world.model.body(OBJECT + obj.name).id), torch.from_numpy(np.flatnonzero(parts.labels == label)))
+            (
+                int(world.model.body(OBJECT + obj.name).id),
+                torch.from_numpy(np.flatnonzero(parts.labels[shown] == label)),
+            )
             for label, obj in enumerate(parts.objects)
             if obj.movable
         ]

@@ -10,6 +10,7 @@ import numpy as np
 
 from splatbot.protocols import Array
 from splatbot.report.moving_page import bytes_of, evenly_spaced, moving_page, packed
+from splatbot.sim.clutter import REPRESENTED
 from splatbot.sim.contact_monitor import FAR
 from splatbot.sim.recording import TwinRecording
 from splatbot.sim.solids import rotation_of
@@ -128,7 +129,7 @@ def _map_points(world: World) -> tuple[Array, Array]:
     model, labels = world.parts.model, world.parts.labels
     means = model.means.double().numpy() @ rotation_of(world.scene.map.rpy).T + world.scene.map.at
     loose = [label for label, obj in enumerate(world.parts.objects) if obj.movable]
-    rows = np.flatnonzero((np.abs(means).max(axis=1) < CONSTANTS.crop_radius) & ~np.isin(labels, loose))
+    rows = np.flatnonzero((np.abs(means).max(axis=1) < CONSTANTS.crop_radius) & ~np.isin(labels, [*loose, REPRESENTED]))
     rows = rows[evenly_spaced(len(rows), CONSTANTS.max_points)]
     return means[rows], model.colors.double().numpy()[rows]
 

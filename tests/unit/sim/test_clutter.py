@@ -18,7 +18,7 @@ from splatbot.gaussians import GaussianModel
 from splatbot.geometry import quat_to_rotation
 from splatbot.robots.panda import panda
 from splatbot.segmentation import find_support, fit
-from splatbot.sim.clutter import MapParts, map_parts
+from splatbot.sim.clutter import REPRESENTED, MapParts, map_parts
 from splatbot.sim.maps.ellipsoids import merge
 from splatbot.sim.motion import hold
 from splatbot.sim.scene import Clutter, make_scene
@@ -228,3 +228,12 @@ def test_a_ring_that_lies_flat_is_no_ball_and_a_ball_of_which_the_top_was_seen_i
     found = fit(top, 0.0)
     assert found.shape["kind"] == "sphere"
     assert found.shape["radius"] == pytest.approx(0.04, abs=1e-6)
+
+
+def test_gaussians_that_an_object_of_the_scene_represents_are_no_obstacle() -> None:
+    x, y, z = BALL.center
+    left = map_parts(scanned(), Clutter(file="scan.ply", without=((x, y, z, BALL.radius + 0.005),)), np.zeros(3))
+    on_ball = np.abs(BALL.distance(scanned().means.double().numpy())) < 1e-3
+    on_ball &= scanned().means[:, 2].numpy() > 0.01
+    assert (left.labels[on_ball] == REPRESENTED).all()
+    assert len(left.objects) == len(parts().objects) - 1
