@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 
+import mujoco
 import numpy as np
 
 from splatbot.protocols import Array
@@ -29,6 +30,7 @@ class Spread:
         backlash: [rad].
         base: standard deviation of the normally distributed base position error, per axis [m].
         yaw: standard deviation of the normally distributed base yaw error [rad].
+        engine: whether MuJoCo's settings of contacts differ too, see :class:`ContactEngine`.
     """
 
     friction: Range = (0.35, 1.2)
@@ -40,11 +42,43 @@ class Spread:
     backlash: Range = (0.0, 0.001)
     base: float = 0.001
     yaw: float = 0.001
+    engine: bool = False
+
+
+@dataclass(frozen=True)
+class ContactEngine:
+    """MuJoCo's settings of contacts in one held-out twin.
+
+    Args:
+        pyramidal: whether friction cones are pyramids.
+        solver: index of MuJoCo's solver: 1 conjugate gradient, 2 Newton.
+        impratio: ratio of the impedances of friction and normal forces. Lower ones let objects creep.
+        softness: time constant of the objects' contacts [s].
+    """
+
+    pyramidal: bool
+    solver: int
+    impratio: float
+    softness: float
+
+
+_IMPRATIO: Range = (3.0, 30.0)  # drawn log-uniformly
+_SOFTNESS: Range = (0.004, 0.02)  # [s]; MuJoCo's default is 0.02
 
 
 @dataclass(frozen=True)
 class HeldOutPhysics:
-    """One draw of :class:`Spread`; ``base`` is the position error (x, y, z) [m] and ``yaw`` the yaw error [rad]."""
+    """One draw of :class:`Spread`.
+
+    Args:
+        friction, mass, gain: factors.
+        lag, latency: [s].
+        joint_friction: fraction of the torque limits.
+        backlash: [rad].
+        base: position error (x, y, z) [m].
+        yaw: yaw error [rad].
+        engine: settings of contacts. If None, those of the effects.
+    """
 
     friction: float
     mass: float
@@ -55,6 +89,7 @@ class HeldOutPhysics:
     backlash: float
     base: tuple[float, float, float]
     yaw: float
+    engine: ContactEngine | None = None
 
 
 def draw(spread: Spread, seed: int) -> HeldOutPhysics:
@@ -63,7 +98,14 @@ def draw(spread: Spread, seed: int) -> HeldOutPhysics:
     names = ("friction", "mass", "gain", "lag", "latency", "joint_friction", "backlash")
     values = {name: float(rng.uniform(*getattr(spread, name))) for name in names}
     x, y, z = (spread.base * rng.standard_normal(3)).tolist()
-    return HeldOutPhysics(**values, base=(x, y, z), yaw=spread.yaw * float(rng.standard_normal()))
+    yaw = spread.yaw * float(rng.standard_normal())
+    engine = None
+    if spread.engine:
+        impratio = float(np.exp(rng.uniform(*np.log(_IMPRATIO))))
+        engine = ContactEngine(
+            bool(rng.random() < 0.5), int(rng.integers(1, 3)), impratio, float(rng.uniform(*_SOFTNESS))
+        )
+    return HeldOutPhysics(**values, base=(x, y, z), yaw=yaw, engine=engine)
 
 
 def held_out_scene(scene: Scene, physics: HeldOutPhysics) -> Scene:
@@ -99,11 +141,21 @@ class HeldOutTwin(Twin):
         self._delayed: deque[tuple[Array, Array, Array, float | None]] = deque()
         super().__init__(held_out_scene(scene, physics), seed=seed)
         self._periods = round(physics.latency * self.rate)
+        if physics.engine is not None:
+            self._set_engine(physics.engine)
         if self.follower is not None and self.world.robot is not None:
             model = self.world.model
             motors = [int(model.actuator(name).id) for name in self.world.robot.chain.names]
             model.actuator_gainprm[motors, 0] *= physics.gain
             model.actuator_biasprm[motors, 1:3] *= physics.gain
+
+    def _set_engine(self, engine: ContactEngine) -> None:
+        model = self.world.model
+        model.opt.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL if engine.pyramidal else mujoco.mjtCone.mjCONE_ELLIPTIC
+        model.opt.solver, model.opt.impratio = engine.solver, engine.impratio
+        # The finger pads keep the softness of the gripper's compliance.
+        of_objects = ~self.world.of_robot
+        model.geom_solref[of_objects, 0] = max(engine.softness, 2.0 * self.timestep)
 
     def reset(self, q: Array | None = None) -> None:
         """Reset the twin and discard the delayed commands."""

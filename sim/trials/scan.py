@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+import zlib
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 
@@ -16,7 +17,7 @@ from splatbot.errors import InputError
 from splatbot.frame import Frame, PosePrior
 from splatbot.gaussians import Snapshot
 from splatbot.geometry import inverse, look_at, se3_exp, transform_points
-from splatbot.grasping.affordance import PointHint
+from splatbot.grasping.affordance import Hint, MaskHint, MasksHint, ObservedView, PointHint
 from splatbot.logs.raycast import Moving, RaycastSurface
 from splatbot.logs.shapes import box
 from splatbot.logs.textures import Texture
@@ -24,22 +25,17 @@ from splatbot.mapping.selfmask import SelfMask
 from splatbot.planning.ik import solve_ik
 from splatbot.protocols import Array
 from splatbot.robots.panda import panda
+from splatbot.sim.effects.depth_holes import DepthHoles
 from splatbot.sim.effects.moving_obstacles import position_on_path
 from splatbot.sim.effects.registry import make_effects
 from splatbot.sim.rays import cast, pixel_rays
 from splatbot.sim.scene import SceneObject
 from splatbot.sim.solids import pose_at
-from splatbot.sim.trials.scenes import TrialScene
+from splatbot.sim.trials.scenes import AROUND_TABLE, TABLE, TrialScene, ScanViews
 from splatbot.sim.trials.surfaces import surfaces_of
 from splatbot.sim.twin import Twin
 from splatbot.sim.wrist import T_PANDA_CAMERA, WristLog
 from splatbot.slam import Slam
-
-_TARGET, _DISTANCE = np.array([0.5, 0.0, 0.05]), 0.6  # [m] point that the camera is aimed at, and the distance to it
-
-
-Rings = tuple[tuple[float, tuple[int, ...]], ...]
-"""[deg] elevation and azimuths of each ring of views around the table."""
 
 
 @dataclass(frozen=True)
@@ -47,21 +43,22 @@ class TrialScanConstants:
     """Constants of the scan of a trial.
 
     Args:
-        rings: [deg] elevation and azimuths of each ring of views.
         max_depth: [m] depth that is used.
         rate: [Hz] frames per second.
         click_stride: every n-th frame is a candidate for the click.
         pose_sigma: [m], [rad] standard deviation of the camera pose by the arm's joints.
+        calibration_sigma: [m], [rad] standard deviation of the hand-eye transform of a trial.
+        holes: share of the pixels of a black object, and of those of glass, without depth.
+        hole_size: [px] their width.
     """
 
-    rings: Rings = (
-        (45.0, (-130, -80, -40, 0, 40, 80)),
-        (65.0, (80, 40, 0, -40, -80)),
-    )
     max_depth: float = 0.95
     rate: float = 4.0
     click_stride: int = 4
     pose_sigma: tuple[float, float] = (5e-4, 5e-4)
+    calibration_sigma: tuple[float, float] = (1e-3, 2e-3)
+    holes: tuple[float, float] = (0.5, 0.8)
+    hole_size: float = 12.0
 
 
 CONSTANTS = TrialScanConstants()
@@ -72,6 +69,12 @@ MAPPING = {"stride": 1, "surface_depth_tolerance": 0.01, "means_lr": 0.0, "refin
 _TABLE = RaycastSurface(
     box([1.0, 1.4, 0.04]).placed([0.6, 0.0, -0.04]), Texture((0.60, 0.50, 0.40), (0.42, 0.33, 0.25), 0.05)
 )
+
+
+_WALLS = Texture((0.72, 0.72, 0.70), (0.60, 0.60, 0.62), 0.25)
+_ROOM = RaycastSurface(
+    box([4.0, 4.0, 2.6]).placed([0.5, 0.0, -0.75]), _WALLS
+)  # seen from inside; the table is 0.75 m high
 
 
 class UnseenError(InputError):
@@ -88,7 +91,8 @@ class TrialScan:
         T_world_base: (4, 4) by the joints at the first frame.
         snapshot: of the map.
         observers: (N, 3) camera position that first observed each Gaussian [m, world]; NaN if unknown.
-        hint: point of the target under a click in one of the frames, from its depth.
+        hints: marks of the target and of the other candidates, each in one frame; a candidate that no frame shows is
+            left out.
         seconds: of mapping.
     """
 
@@ -97,7 +101,7 @@ class TrialScan:
     T_world_base: Array
     snapshot: Snapshot
     observers: Array
-    hint: PointHint
+    hints: dict[str, Hint]
     seconds: float
 
     @property
@@ -122,7 +126,8 @@ def scan_scene(
     frames: int = 32,
     width: int = 320,
     config: Config | None = None,
-    rings: Rings = CONSTANTS.rings,
+    viewpoints: ScanViews | None = None,
+    calibrated: bool = True,
 ) -> TrialScan:
     """Move the camera over the scene and map its frames.
 
@@ -133,22 +138,26 @@ def scan_scene(
         frames: number of frames.
         width: of an image [px]; the height is 3/4 of it.
         config: of mapping. If None, it is finer than the default and keeps the means fixed (:data:`MAPPING`).
-        rings: views that the camera passes, from first to last.
+        viewpoints: of the camera. If None, those of the trial.
+        calibrated: whether the hand-eye transform is exact; if not, it has an error that is constant in the scan.
 
     Raises:
-        UnseenError: no image shows the target.
+        UnseenError: no image shows the target, nor another candidate.
     """
-    log = _log(trial, camera_path(frames, rings), width)
+    joints = camera_path(frames, viewpoints or trial.viewpoints)
+    log = _log(trial, joints, width)
     true = log.ground_truth.T_world_camera
     rng = np.random.default_rng(trial.seed)
     sigma = np.repeat(CONSTANTS.pose_sigma, 3)
-    prior_poses = np.stack([T @ se3_exp(sigma * rng.standard_normal(6)) for T in true])
+    error = np.zeros(6) if calibrated else np.repeat(CONSTANTS.calibration_sigma, 3) * _calibration_draw(trial.seed)
+    prior_poses = np.stack([T @ se3_exp(error) @ se3_exp(sigma * rng.standard_normal(6)) for T in true])
     mask = SelfMask(log.robot, T_PANDA_CAMERA)
     assert trial.scene.camera is not None
     effects = make_effects(trial.scene.camera.sensor, seed=trial.seed, why="sensor of the wrist").along(
         log.ground_truth
     )
-    shot = tuple(effects(mask(log[k])) for k in range(frames))
+    shown = _with_materials(trial, log, joints)
+    shot = tuple(effects(mask(shown(k))) for k in range(frames))
     begin = time.perf_counter()
     slam = Slam(config or Config.model_validate({"mapping": MAPPING, "sensor": {"max_depth": CONSTANTS.max_depth}}))
     for frame, T in zip(shot, prior_poses, strict=True):
@@ -166,25 +175,26 @@ def scan_scene(
         inverse(prior_poses[0]),
         snapshot,
         _observers(snapshot, keyframes),
-        _click(trial, log, shot, poses),
+        _hints(trial, log, shot, poses),
         seconds,
     )
 
 
 @cache
-def camera_path(frames: int, rings: Rings = CONSTANTS.rings) -> Array:
-    """Return the joints (F, J) of a path around the table's centre, by default with a higher ring on the way back.
+def camera_path(frames: int, viewpoints: ScanViews = AROUND_TABLE) -> Array:
+    """Return the joints (F, J) of a path past viewpoints.
 
     Raises:
         InputError: a pose cannot be reached.
     """
     robot = panda()
     near, knots = robot.home, []
-    for steep, turns in rings:
+    target = np.array(viewpoints.target)
+    for steep, turns in viewpoints.rings:
         for turn in turns:
             t, s = np.radians([turn, steep])
-            eye = _TARGET + _DISTANCE * np.array([np.cos(t) * np.cos(s), np.sin(t) * np.cos(s), np.sin(s)])
-            T = look_at(eye, _TARGET)
+            eye = target + viewpoints.distance * np.array([np.cos(t) * np.cos(s), np.sin(t) * np.cos(s), np.sin(s)])
+            T = look_at(eye, target)
             T[:3, :2] *= -1.0  # the hand's x axis is directed away from the base, as at home
             found = solve_ik(robot, T @ inverse(T_PANDA_CAMERA) @ robot.T_link_tcp, near=near)
             if not len(found.q):
@@ -195,16 +205,54 @@ def camera_path(frames: int, rings: Rings = CONSTANTS.rings) -> Array:
     return np.stack([np.interp(at, np.arange(len(knots)), column) for column in np.array(knots).T], axis=1)
 
 
-def _log(trial: TrialScene, joints: Array, width: int) -> WristLog:
-    objects = [obj for obj in trial.scene.objects if obj.movable]
+def _log(trial: TrialScene, joints: Array, width: int, without: Collection[str] = ()) -> WristLog:
+    objects = [obj for obj in trial.scene.objects if obj.name not in (TABLE, *without) and not obj.path]
     still = [surface for k, obj in enumerate(objects) for surface in surfaces_of(obj, seed=k)]
     moving = {}
     for obj in trial.scene.carried:
         shown = surfaces_of(obj, placed=False)
         moving[obj.name] = Moving(shown, partial(_pose_on_path, obj))
     return WristLog(
-        panda(), joints, [_TABLE, *still], T_scene_base=np.eye(4), width=width, rate=CONSTANTS.rate, moving=moving
+        panda(),
+        joints,
+        [_ROOM, _TABLE, *still],
+        T_scene_base=np.eye(4),
+        width=width,
+        rate=CONSTANTS.rate,
+        moving=moving,
     )
+
+
+def _with_materials(trial: TrialScene, log: WristLog, joints: Array) -> Callable[[int], Frame]:
+    """Return the reader of frames whose depth has the errors of black and glass objects.
+
+    Both lose depth in blobs. The other pixels of glass measure the surface behind it.
+    """
+    names = {material: [n for n, m in trial.materials.items() if m == material] for material in ("black", "glass")}
+    logs = {m: _log(trial, joints, log.camera.width, found) for m, found in names.items() if found}
+    holes = {
+        material: DepthHoles(share=share, size=CONSTANTS.hole_size)
+        for material, share in zip(names, CONSTANTS.holes, strict=True)
+    }
+
+    def read(k: int) -> Frame:
+        frame = log[k]
+        depth = frame.depth.copy()
+        for number, (material, bare) in enumerate(logs.items()):
+            behind = bare[k].depth
+            own = (frame.depth > 0) & ((behind == 0) | (behind > frame.depth + 1e-6))
+            rng = np.random.default_rng((trial.seed, k, number))
+            seen = own & (holes[material].apply(replace(frame, depth=np.where(own, frame.depth, 0)), rng).depth > 0)
+            depth[own & ~seen] = 0.0
+            if material == "glass":
+                depth[seen] = behind[seen]
+        return replace(frame, depth=depth)
+
+    return read
+
+
+def _calibration_draw(seed: int) -> Array:
+    return np.random.default_rng((seed, zlib.crc32(b"calibration"))).standard_normal(6)
 
 
 def _pose_on_path(obj: SceneObject, t: float) -> Array:
@@ -218,23 +266,36 @@ def _observers(snapshot: Snapshot, T_world_keyframe: Array) -> Array:
     return np.asarray(known[np.where(inside, anchors, len(T_world_keyframe))])
 
 
-def _click(trial: TrialScene, log: WristLog, frames: Sequence[Frame], poses: Array) -> PointHint:
-    """Return the central target pixel with depth in the tracked frame with most of them, as a user would click."""
+def _hints(trial: TrialScene, log: WristLog, frames: Sequence[Frame], poses: Array) -> dict[str, Hint]:
+    """Mark each candidate in tracked frames.
+
+    A single target is marked by a click on its central pixel with depth, in the frame with most of them. If any object
+    may be picked, masks mark it in every fourth frame, as segmentation of the images would; they are exact.
+    """
     twin = Twin(trial.scene)
-    best: tuple[int, NDArray[np.bool_]] | None = None
+    shown: dict[str, list[tuple[int, NDArray[np.bool_]]]] = {}
     for k in range(0, len(frames), CONSTANTS.click_stride):
         if not np.isfinite(poses[k]).all():
             continue
         twin.reset(log.joints[k])
         geoms, _ = cast(twin.world.model, twin.data, pixel_rays(log.camera), log.ground_truth.T_world_camera[k], 3.0)
-        owners = np.array([*twin.world.owner, ""])
-        shows = (owners[geoms] == trial.target) & ~log.shows_robot(k) & (usable_depth(frames[k]) > 0)
-        if best is None or shows.sum() > best[1].sum():
-            best = k, shows
-    if best is None or not best[1].any():
+        owners = np.array([*twin.world.owner, ""])[geoms]
+        for name in (trial.target, *trial.others):
+            shows = (owners == name) & ~log.shows_robot(k)
+            if (shows & (usable_depth(frames[k]) > 0)).any():
+                shown.setdefault(name, []).append((k, shows))
+    if not shown:
         raise UnseenError("is in no picture.", field=trial.target, hint="give another seed")
-    k, shows = best
+    if not trial.others:
+        measured = [(k, shows & (usable_depth(frames[k]) > 0)) for k, shows in shown[trial.target]]
+        k, shows = max(measured, key=lambda one: int(one[1].sum()))
+        return {trial.target: _click_hint(frames[k], poses[k], shows)}
+    views = {k: ObservedView(log.camera, poses[k], f.rgb, usable_depth(f)) for k, f in enumerate(frames)}
+    return {name: MasksHint(tuple(MaskHint(m, views[k]) for k, m in masks)) for name, masks in shown.items()}
+
+
+def _click_hint(frame: Frame, T_world_camera: Array, shows: NDArray[np.bool_]) -> PointHint:
     v, u = np.nonzero(shows)
     nearest = int(np.argmin((v - v.mean()) ** 2 + (u - u.mean()) ** 2))
-    at = log.camera.backproject(usable_depth(frames[k]))[v[nearest], u[nearest]].astype(np.float64)
-    return PointHint(transform_points(poses[k], at))
+    at = frame.camera.backproject(usable_depth(frame))[v[nearest], u[nearest]].astype(np.float64)
+    return PointHint(transform_points(T_world_camera, at))

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 import torch
 
-from splatbot.collision import find_moving, gather_evidence
+from splatbot.collision import GaussianCollisionField, RobotSpheres, find_moving, gather_evidence
 from splatbot.config import SensorConfig
-from splatbot.grasping.affordance import Target, find_target
+from splatbot.grasping.affordance import AffordanceError, Hint, Target, find_target
 from splatbot.grasping.measured import RawDepth
 from splatbot.grasping.options import GraspOptions
 from splatbot.grasping.pick_planner import MapPickPlanner, PickPlan, PickPlanner, Segment
@@ -22,9 +22,11 @@ from splatbot.grasping.spatial import SpatialAffordance
 from splatbot.grasping.types import Grasp, GraspResult
 from splatbot.planning import JointGoal
 from splatbot.protocols import Array
+from splatbot.results.plan_obstacles import PlanObstacles
 from splatbot.robots.panda import panda
 from splatbot.segmentation import SegmentedMap, segment
 from splatbot.sim.trials.scan import TrialScan
+from splatbot.sim.trials.scenes import TrialScene
 
 
 @dataclass(frozen=True)
@@ -35,11 +37,13 @@ class StackConstants:
         lift: [m] lift of a pick; success requires 0.15 m.
         budget_ms: [ms] budget of the path search.
         min_observations: keyframes that must support a Gaussian.
+        margin: [m] clearance of the arm on its way to the pre-grasp.
     """
 
     lift: float = 0.18
     budget_ms: float = 28.0
     min_observations: int = 3
+    margin: float = 0.005
 
 
 CONSTANTS = StackConstants()
@@ -85,7 +89,12 @@ class Stack(Protocol):
 
 
 class GaussianStack:
-    """The Gaussians of the map, with certified paths."""
+    """The Gaussians of the map, with certified paths.
+
+    The way to the pre-grasp has the obstacles of ``splatbot plan``: the map at 2 sigma and its support plane. A scene
+    with places of motion has these instead. Unknown space is free: of space near the camera's path few views decide,
+    and the holes of the simulated depth would close it.
+    """
 
     name = "gaussians"
     looks = False
@@ -94,6 +103,12 @@ class GaussianStack:
         """Implement :meth:`Stack.learn`."""
         begin = time.perf_counter()
         sampler = self.sampler(scan)
+        if sampler.moving is None:
+            _agree_with_plans(sampler, scan)
+        return self.known(scan, sampler, begin)
+
+    def known(self, scan: TrialScan, sampler: GraspSampler, begin: float) -> StackMap:
+        """Return the stack's representation with a sampler, built since ``begin`` [s]."""
         seconds = scan.seconds + time.perf_counter() - begin
         world = sampler.scene.model.nbytes + sampler.field.nbytes
         return StackMap(
@@ -114,8 +129,27 @@ class GaussianStack:
             views=scan.views,
             raw=RawDepth(tuple(scan.views), SENSOR.sigma_depth_floor, SENSOR.sigma_depth_quad),
             min_observations=CONSTANTS.min_observations,
+            arm_margin=CONSTANTS.margin,
             moving=moving,
         )
+
+
+def _agree_with_plans(sampler: GraspSampler, scan: TrialScan) -> None:
+    """Give a sampler the obstacles of plans from the home configuration of its robot."""
+    T, model, support = sampler.scene.T_world_base, sampler.scene.model, sampler.scene.support
+    arm = RobotSpheres(panda(), T_world_base=T)
+    plane = None
+    if support is not None:
+        normal = T[:3, :3] @ support.normal
+        plane = np.append(normal, -support.offset - normal @ T[:3, 3])
+    around = PlanObstacles(
+        GaussianCollisionField(model, min_observations=CONSTANTS.min_observations),
+        model,
+        arm,
+        panda().home,
+        plane=plane,
+    )
+    sampler.agree_with_plans(around.field(CONSTANTS.margin))
 
 
 class LookingStack(GaussianStack):
@@ -123,6 +157,10 @@ class LookingStack(GaussianStack):
 
     name = "gaussians_look"
     looks = True
+
+    def learn(self, scan: TrialScan) -> StackMap:
+        """Implement :meth:`Stack.learn` without the obstacles of plans, which do not follow a target that moved."""
+        return self.known(scan, self.sampler(scan), time.perf_counter())
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,17 +184,41 @@ class StackDecision:
     looks: bool = False
 
 
-def decide(known: StackMap, scan: TrialScan, *, looks: bool = False) -> StackDecision:
-    """Find the object under the click, and grasps of it.
+def decide(known: StackMap, hint: Hint, *, looks: bool = False) -> StackDecision:
+    """Find the object that a hint marks, and grasps of it.
 
     Raises:
         AffordanceError: there is no object.
     """
-    target = find_target(scan.hint, known.scene, [SpatialAffordance()])
+    target = find_target(hint, known.scene, [SpatialAffordance()])
     sampler, planner = known.planners(target)
     begin = time.perf_counter()
     grasps = sampler.sample(target, OPTIONS.grasp)
     return StackDecision(target, sampler, grasps, _CachedPlanner(planner), time.perf_counter() - begin, looks)
+
+
+def choose(
+    known: StackMap, trial: TrialScene, scan: TrialScan, *, looks: bool = False
+) -> tuple[TrialScene, StackDecision]:
+    """Return the trial with the candidate whose best grasp has the highest confidence, and its grasps.
+
+    Raises:
+        AffordanceError: there is no object at any hint.
+    """
+    found: list[tuple[str, StackDecision]] = []
+    refused: AffordanceError | None = None
+    for name, hint in scan.hints.items():
+        try:
+            found.append((name, decide(known, hint, looks=looks)))
+        except AffordanceError as error:
+            refused = error
+    if not found:
+        assert refused is not None
+        raise refused
+    name, best = max(found, key=lambda one: max((g.confidence for g in one[1].grasps.grasps), default=-1.0))
+    seconds = sum(decision.seconds for _, decision in found)
+    kinds = {trial.target: trial.kind, **trial.others}
+    return replace(trial, target=name, kind=kinds[name]), replace(best, seconds=seconds)
 
 
 class _CachedPlanner:

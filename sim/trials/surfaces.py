@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import ConvexHull
 
 from splatbot.errors import InputError
 from splatbot.geometry import transform_points
@@ -12,7 +13,7 @@ from splatbot.logs.raycast import RaycastSurface
 from splatbot.logs.shapes import TriangleMesh, box, cylinder, sphere
 from splatbot.logs.textures import Texture
 from splatbot.sim.scene import SceneObject
-from splatbot.sim.solids import BoxGeom, CapsuleGeom, CylinderGeom, EllipsoidGeom, Shape, SphereGeom, pose_at
+from splatbot.sim.solids import BoxGeom, CapsuleGeom, CylinderGeom, EllipsoidGeom, MeshGeom, Shape, SphereGeom, pose_at
 from splatbot.sim.wrist import capsule_mesh
 
 
@@ -36,7 +37,7 @@ def surfaces_of(obj: SceneObject, *, placed: bool = True, seed: int = 0) -> list
     """Convert an object's shapes to meshes with a pattern in its colour, in the scene's frame or in its own.
 
     Raises:
-        InputError: a shape has no mesh here: planes, hulls and soft bodies.
+        InputError: a shape has no mesh here: planes, mesh files and soft bodies.
     """
     r, g, b = obj.color
     texture = Texture(
@@ -45,14 +46,18 @@ def surfaces_of(obj: SceneObject, *, placed: bool = True, seed: int = 0) -> list
     T = pose_at(obj.at, obj.rpy) if placed else np.eye(4)
     found = []
     for shape in obj.shapes:
-        mesh = _mesh(shape, obj.name)
+        mesh = mesh_of(shape, obj.name)
         vertices = transform_points(T @ pose_at(shape.at, shape.rpy), mesh.vertices)
         found.append(RaycastSurface(TriangleMesh(vertices, mesh.triangles), texture))
     return found
 
 
-def _mesh(shape: Shape, name: str) -> TriangleMesh:
-    """Convert a shape to a mesh about its centre."""
+def mesh_of(shape: Shape, name: str) -> TriangleMesh:
+    """Convert a shape of the object ``name`` to a mesh in the shape's own frame.
+
+    Raises:
+        InputError: the shape is a plane, a mesh file or a soft body.
+    """
     if isinstance(shape, BoxGeom):
         return box(shape.size).placed([0.0, 0.0, -shape.size[2] / 2])
     if isinstance(shape, CylinderGeom):
@@ -64,4 +69,12 @@ def _mesh(shape: Shape, name: str) -> TriangleMesh:
         return TriangleMesh(ball.vertices * np.asarray(shape.axes), ball.triangles)
     if isinstance(shape, CapsuleGeom):
         return capsule_mesh([0.0, 0.0, -shape.height / 2], [0.0, 0.0, shape.height / 2], shape.radius)
-    raise InputError(f"is a {shape.kind}.", field=name, hint="give boxes, cylinders, spheres, ellipsoids or capsules")
+    if isinstance(shape, MeshGeom) and shape.points:
+        points = shape.scale * np.asarray(shape.points, dtype=np.float64)
+        hull = ConvexHull(points)
+        corners = hull.vertices
+        rows = np.full(len(points), -1)
+        rows[corners] = np.arange(len(corners))
+        return TriangleMesh(points[corners], rows[hull.simplices].astype(np.uint32))
+    hint = "give boxes, cylinders, spheres, ellipsoids, capsules or hulls of points"
+    raise InputError(f"is a {shape.kind}.", field=name, hint=hint)

@@ -10,11 +10,11 @@ import mujoco
 import numpy as np
 
 from splatbot.sim.compare.agreement import wilson
-from splatbot.sim.compare.held_out import HeldOutTwin, Spread, draw
 from splatbot.sim.trials.scenes import TrialScene
 from splatbot.sim.trials.shake import CONSTANTS as SHAKE
 from splatbot.sim.trials.shake import Shake, strength
-from splatbot.sim.trials.trial import TrialRow
+from splatbot.sim.trials.trial import HELD_OUT, TrialRow
+from splatbot.sim.twin import Twin
 
 _MEGA = 1e6
 _SAMPLES = 2001  # of the shaking motion
@@ -50,11 +50,11 @@ def summary(rows: Sequence[TrialRow]) -> dict[str, Any]:
 
 def physics(trial: TrialScene) -> dict[str, Any]:
     """Return the physics parameters of the trials' twins, on which success rates depend."""
-    twin = HeldOutTwin(trial.scene, draw(Spread(), trial.seed))
+    twin = Twin(trial.scene)
     option, robot = twin.world.model.opt, twin.world.robot
     assert robot is not None
     assert robot.gripper is not None
-    spread = Spread()
+    spread = HELD_OUT
     shake = Shake(robot.chain, robot.home)
     places = robot.tcp(np.array([shake.reference(float(t))[0] for t in np.linspace(0.0, shake.duration, _SAMPLES)]))
     return {
@@ -69,6 +69,7 @@ def physics(trial: TrialScene) -> dict[str, Any]:
         "held_out_mass": spread.mass,
         "held_out_gain": spread.gain,
         "held_out_latency_s": spread.latency,
+        "held_out_engine": "cone, solver, impratio and softness of contacts drawn" if spread.engine else "as above",
     }
 
 

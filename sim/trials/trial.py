@@ -28,7 +28,7 @@ from splatbot.sim.picking import push_aside
 from splatbot.sim.trials.scan import TrialScan, UnseenError, scan_scene
 from splatbot.sim.trials.scenes import TABLE, TrialScene
 from splatbot.sim.trials.shake import Shake
-from splatbot.sim.trials.stacks import OPTIONS, Stack, StackDecision, StackMap, decide
+from splatbot.sim.trials.stacks import OPTIONS, Stack, StackDecision, StackMap, choose
 from splatbot.sim.twin import Twin
 from splatbot.sim.video import Video
 from splatbot.sim.world import OBJECT
@@ -51,6 +51,9 @@ class TrialConstants:
 
 
 CONSTANTS = TrialConstants()
+
+HELD_OUT = Spread(engine=True)
+"""Physics of the held-out twin. The ranges were chosen before any trial ran with them."""
 
 
 Watch = Callable[[Any, float], None]
@@ -164,7 +167,7 @@ def run_trial(
         moved: distance by which the target is pushed aside after the scan [m].
     """
     try:
-        seen = scan_scene(trial, frames=frames, width=width)
+        seen = scan_scene(trial, frames=frames, width=width, calibrated=False)
     except UnseenError as error:
         both = _no_target(error)
         rows = [_row(stack, trial, (frames, width), None, None, None, both, both) for stack in stacks]
@@ -179,7 +182,7 @@ def pick_with(
     known = stack.learn(seen)
     scan = len(seen.frames), seen.frames[0].camera.width
     try:
-        decision = decide(known, seen, looks=stack.looks)
+        trial, decision = choose(known, trial, seen, looks=stack.looks)
     except AffordanceError as error:
         both = _no_target(error)
         return _row(stack, trial, scan, known, None, None, both, both)
@@ -267,8 +270,8 @@ class _Watched(TwinController):
 
 
 def held_out_twin(trial: TrialScene) -> HeldOutTwin:
-    """Return the twin of a scene with other friction, masses, gains and delays, and all effects."""
-    return HeldOutTwin(trial.scene, draw(Spread(), trial.seed))
+    """Return the twin of a scene with other friction, masses, gains, delays and engine settings, and all effects."""
+    return HeldOutTwin(trial.scene, draw(HELD_OUT, trial.seed))
 
 
 def _film(decision: StackDecision, trial: TrialScene, path: Path, moved: float) -> None:

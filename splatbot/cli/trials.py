@@ -13,7 +13,7 @@ from splatbot.cli.paths import check_output
 
 def trials(
     *,
-    scenes: Literal["tabletop", "isolated"] = "tabletop",
+    scenes: Literal["tabletop", "isolated", "packed", "bin", "shelf"] = "tabletop",
     trials: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
     full: bool = False,
     stacks: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...")] = ("gaussians",),
@@ -29,9 +29,13 @@ def trials(
     """Pick in seeded scenes in the twin, end to end, and report the success rate and the failures.
 
     The arm's wrist camera scans each scene with noise and holes in its depth. The frames are mapped, and a click
-    selects an object. A stack plans grasp and path with only that map. The pick runs in the twin of the scene, and in a
-    twin with other friction, masses, gains and delays and every effect ("reality"). It succeeds if the hand lifts the
-    object by 15 cm and still holds it after shaking. All stacks get the same frames at the same poses.
+    selects an object. A stack plans grasp and path with only that map. The pick runs in the twin of the scene. It runs
+    again in a twin ("reality") with other friction, masses, gains, delays and contact settings, and every effect. It
+    succeeds if the hand lifts the object by 15 cm and still holds it after shaking. All stacks get the same frames at
+    the same poses.
+
+    In packed, bin and shelf scenes any object may be picked, the one with the best grasp. Exact masks mark the objects
+    in every fourth frame. A tenth of the objects is black, another tenth glass; both lack depth.
 
     Stacks: gaussians (the map), gaussians_look (with a look from the wrist), mesh (fused depth, marching cubes,
     python-fcl), cloud (points, an octree, python-fcl).
@@ -41,14 +45,14 @@ def trials(
 
     Examples:
         splatbot trials --jobs 2
-        splatbot trials --scenes isolated --trials 24 --out runs/isolated
+        splatbot trials --scenes bin --trials 100 --jobs 2 --videos --out runs/bin
         splatbot trials --moved 0.02 --stacks gaussians gaussians_look --out runs/moved
         splatbot trials --full --stacks gaussians mesh cloud --jobs 2 --out runs/trials
 
     Args:
-        scenes: tabletop has cups, tools and clutter, and a moving object in every fifth scene. isolated has one convex
-            object.
-        trials: number of scenes; by default 50, or 24 with isolated objects.
+        scenes: tabletop has cups, tools and clutter, and a moving object in every fifth scene; isolated has one object.
+            packed has upright objects 5 to 20 mm apart, bin a pile, and shelf objects below a board.
+        trials: number of scenes; by default 50, or 27 with isolated objects.
         full: run 250 scenes.
         stacks: stacks to compare: gaussians, gaussians_look, mesh, cloud.
         first: seed of the first scene.
@@ -70,7 +74,7 @@ def trials(
     from splatbot.sim.trials.scenes import make_trial
     from splatbot.sim.trials.table import physics, summaries
 
-    count = trials if trials is not None else 250 if full else 24 if scenes == "isolated" else 50
+    count = trials if trials is not None else 250 if full else 27 if scenes == "isolated" else 50
     plan = TrialsPlan(scenes, count, stacks, first, jobs, frames, width, videos, moved)
     folder = out if out is not None else Path("runs") / "trials"
     with shares(quiet) as tell:

@@ -29,6 +29,7 @@ class UnknownConstants:
     Args:
         suspect_views: number of views whose pixels of a voxel lack depth that make it suspect.
         suspect_share: least share of the pixels of a voxel without depth in such a view.
+        suspect_ratio: least ratio of such views to all views of the voxel, because a sensor's random holes affect few.
         radii: [px] half the sides of the squares of pixels that are tested. A voxel that covers more pixels is too
             close to the camera.
         scattered: [px] groups of so few pixels without depth are noise, and take the least depth around them.
@@ -37,6 +38,7 @@ class UnknownConstants:
 
     suspect_views: int = 2
     suspect_share: float = 0.1
+    suspect_ratio: float = 1 / 3
     radii: tuple[int, ...] = (1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 12, 14, 17, 20, 24, 29, 35, 42, 50, 60)
     scattered: int = 3
     block: int = 8
@@ -55,8 +57,9 @@ class UnknownSpace:
 
     Args:
         unknown: (X, Y, Z), True where unknown.
-        suspect: (X, Y, Z), True where unknown and two views looked there without measuring depth, as at dark, thin,
-            shiny or transparent objects. Space behind surfaces and outside of all images is not suspect.
+        suspect: (X, Y, Z), True where unknown and views measure no depth, as at dark, thin, shiny or transparent
+            objects. These are at least two views, and a third of all that look there. Space behind surfaces and outside
+            of all images is not suspect.
         origin: (3,) corner of the first voxel [m, world].
         voxel: edge length [m].
     """
@@ -131,7 +134,8 @@ def find_unknown(aabb: ArrayLike, voxel: float, views: Iterable[DepthView]) -> U
     Args:
         aabb: (2, 3) = (low, high), corners of the box [m, world].
         voxel: edge length [m].
-        views: depth (H, W) [m], 0 or NaN where invalid, camera, and T_world_camera (4, 4) of each view.
+        views: depth (H, W) [m], camera, and T_world_camera (4, 4) of each view. Depth is 0 where none was measured, and
+            NaN where a mask covers the pixel, such as that of the robot: there the view did not look.
 
     Raises:
         InputError: the box is empty, or the voxel is not above 0.
@@ -146,17 +150,20 @@ def find_unknown(aabb: ArrayLike, voxel: float, views: Iterable[DepthView]) -> U
     corners, in_image = _blocks(low, size, voxel, views)
     in_block = np.moveaxis(np.indices((CONSTANTS.block,) * 3), 0, -1).reshape(1, -1, 3)
     cells = (corners[:, None] + in_block).reshape(-1, 3).astype(np.int32)
-    open_, missing = np.zeros(len(cells), np.bool_), np.zeros(len(cells), np.int32)
+    open_ = np.zeros(len(cells), np.bool_)
+    missing, looks = np.zeros(len(cells), np.int32), np.zeros(len(cells), np.int32)
     for view, met in zip(views, in_image, strict=True):
         left = np.flatnonzero(~open_ & np.repeat(met, CONSTANTS.block**3))
-        empty, lacks_depth = _observed(cells[left] * voxel + low + voxel / 2, radius, view)
+        empty, looked, lacks_depth = _observed(cells[left] * voxel + low + voxel / 2, radius, view)
         open_[left[empty]] = True
+        looks[left[looked]] += 1
         missing[left[lacks_depth]] += 1
     inside = (cells < size).all(axis=1)  # the last blocks extend beyond the box
-    cells, open_, missing = cells[inside], open_[inside], missing[inside]
+    cells, open_ = cells[inside], open_[inside]
+    often = (missing >= CONSTANTS.suspect_views) & (missing >= CONSTANTS.suspect_ratio * looks)
     unknown, suspect = np.ones(tuple(size), np.bool_), np.zeros(tuple(size), np.bool_)
     unknown[tuple(cells.T)] = ~open_
-    suspect[tuple(cells.T)] = ~open_ & (missing >= CONSTANTS.suspect_views)
+    suspect[tuple(cells.T)] = ~open_ & often[inside]
     return UnknownSpace(unknown, suspect, low, float(voxel))
 
 
@@ -184,12 +191,17 @@ def _in_image(centers: Array, radius: float, view: DepthView) -> NDArray[np.bool
     return met
 
 
-def _observed(centers: Array, radius: float, view: DepthView) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return which spheres (P,) of a radius [m] a view shows to be empty, and at which it lacks depth."""
+def _observed(
+    centers: Array, radius: float, view: DepthView
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return which spheres (P,) of a radius [m] a view shows to be empty, looks at, and lacks depth at.
+
+    A view does not look at spheres that are hidden by a surface, or covered by a mask.
+    """
     depth, camera, T_world_camera = view
     p = transform_points(inverse(T_world_camera), centers)
     z = p[:, 2]
-    empty, lacks_depth = np.zeros(len(p), np.bool_), np.zeros(len(p), np.bool_)
+    empty, looked, lacks_depth = (np.zeros(len(p), np.bool_) for _ in range(3))
     u = np.rint(camera.fx * p[:, 0] / np.maximum(z, 1e-6) + camera.cx)
     v = np.rint(camera.fy * p[:, 1] / np.maximum(z, 1e-6) + camera.cy)
     seen = np.flatnonzero((z > 2 * radius) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height))
@@ -200,7 +212,8 @@ def _observed(centers: Array, radius: float, view: DepthView) -> tuple[NDArray[n
     reach = np.ceil(max(camera.fx, camera.fy) * radius / near * stretch + 0.5)
     measured = _without_scattered_holes(depth)
     known = measured > 0
-    holes = (~known).astype(np.float32)
+    masked = np.isnan(depth)
+    holes = (~known & ~masked).astype(np.float32)
     for smaller, width in pairwise((0, *CONSTANTS.radii)):
         chosen = np.flatnonzero((reach > smaller) & (reach <= width))
         if len(chosen):
@@ -211,8 +224,9 @@ def _observed(centers: Array, radius: float, view: DepthView) -> tuple[NDArray[n
             share = cv2.blur(holes, square.shape)[row, column]
             empty[seen[chosen]] = nearest > z[chosen] + radius
             hidden = (farthest > 0) & (farthest < z[chosen] - radius)
+            looked[seen[chosen]] = ~hidden & ~masked[row, column]
             lacks_depth[seen[chosen]] = (share >= CONSTANTS.suspect_share) & ~hidden
-    return empty, lacks_depth
+    return empty, looked, lacks_depth
 
 
 def _without_scattered_holes(depth: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -24,11 +24,14 @@ class ObservedView:
         camera: undistorted pinhole camera.
         T_world_camera: (4, 4) pose of the camera.
         rgb: (H, W, 3) uint8 image for backends that use images. If None, the map is rendered.
+        depth: (H, W) measured depth [m], 0 where it is missing or shows the robot. Masks count only where it shows the map.
+            If None, the map is rendered.
     """
 
     camera: Camera
     T_world_camera: Array
     rgb: NDArray[np.uint8] | None = None
+    depth: NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True)
@@ -63,6 +66,13 @@ class MaskHint:
 
 
 @dataclass(frozen=True, eq=False)
+class MasksHint:
+    """Masks of one object in several views, as video segmentation gives them; they separate touching objects."""
+
+    masks: tuple[MaskHint, ...]
+
+
+@dataclass(frozen=True, eq=False)
 class BoxHint:
     """A rectangle of a view [px], both corners within it."""
 
@@ -88,7 +98,7 @@ class TagHint:
     family: str = "36h11"
 
 
-Hint = NameHint | PixelHint | PointHint | MaskHint | BoxHint | TagHint
+Hint = NameHint | PixelHint | PointHint | MaskHint | MasksHint | BoxHint | TagHint
 H = TypeVar("H", NameHint, TagHint)
 
 

@@ -15,6 +15,7 @@ from splatbot.grasping.affordance import (
     BoxHint,
     Hint,
     MaskHint,
+    MasksHint,
     ObservedView,
     PixelHint,
     PointHint,
@@ -23,6 +24,7 @@ from splatbot.grasping.affordance import (
 from splatbot.protocols import Array
 from splatbot.rasterize.views import render_view
 from splatbot.segmentation import MapObject, SegmentedMap
+from splatbot.segmentation.clusters import clusters
 from splatbot.segmentation.faces import find_faces, nearest_of
 from splatbot.segmentation.objects import CONSTANTS as SEGMENTATION
 
@@ -35,12 +37,14 @@ class SpatialConstants:
         max_distance: [m] maximum distance between an indicated point and a Gaussian of the object.
         min_mask_majority: least fraction of a mask's object pixels that belong to the selected object.
         mask_margin: [m] margin around a mask; smaller differences are errors at its boundary.
+        min_marked_fraction: least fraction of a mask's Gaussians in each connected piece of a marked part.
         min_outside_fraction: a mask selects a part if more than this fraction of the visible object is outside.
     """
 
     max_distance: float = 0.02
     min_mask_majority: float = 0.6
     mask_margin: float = 0.01
+    min_marked_fraction: float = 0.05
     min_outside_fraction: float = 0.15
 
 
@@ -49,7 +53,8 @@ CONSTANTS = SpatialConstants()
 
 _WITHIN = "the point is inside of the object, not on its surface"
 _TOUCHING = "the object is connected with others in the map; the target is the marked part"
-_UNSEGMENTED = "it is not a segmented object; the target is the marked part of its faces"
+_MARKED = "the target is the part of the map that the masks show"
+_UNSEGMENTED = "it is not a segmented object; the target is the marked part"
 
 
 class SpatialAffordance:
@@ -59,7 +64,7 @@ class SpatialAffordance:
 
     def understands(self, hint: Hint) -> bool:
         """Return whether the hint is a pixel, point, mask or rectangle."""
-        return isinstance(hint, PixelHint | PointHint | MaskHint | BoxHint)
+        return isinstance(hint, PixelHint | PointHint | MaskHint | MasksHint | BoxHint)
 
     def locate(self, hint: Hint, scene: SegmentedMap) -> Target:
         """Find the object at the position; see :class:`splatbot.grasping.affordance.Affordance`."""
@@ -69,6 +74,8 @@ class SpatialAffordance:
             return at_point(scene, point_at(scene, hint.view, hint.u, hint.v))
         if isinstance(hint, MaskHint):
             return _at_mask(scene, hint.view, np.asarray(hint.mask), exact=True)
+        if isinstance(hint, MasksHint):
+            return _at_masks(scene, hint)
         if isinstance(hint, BoxHint):
             return _at_mask(scene, hint.view, _rectangle(hint))
         raise InputError(f"is a {type(hint).__name__}.", field="hint", hint="give a pixel, point, mask or rectangle")
@@ -163,9 +170,7 @@ def _face_at(scene: SegmentedMap, point: Array) -> NDArray[np.int64]:
 
 def _at_mask(scene: SegmentedMap, view: ObservedView, mask: NDArray[np.bool_], *, exact: bool = False) -> Target:
     """Return the object that a mask shows; an ``exact`` mask that covers only a part of an object selects the part."""
-    c = view.camera
-    if mask.shape != (c.height, c.width) or mask.dtype != np.bool_:
-        raise InputError(f"is {mask.dtype} {mask.shape}.", field="mask", hint=f"give ({c.height}, {c.width}) booleans")
+    mask = _checked_mask(mask, view)
     seeds = _visible(scene, view, mask)
     if not len(seeds):
         raise AffordanceError("shows nothing of the map.", field="mask", hint="mark an object in the image")
@@ -173,7 +178,7 @@ def _at_mask(scene: SegmentedMap, view: ObservedView, mask: NDArray[np.bool_], *
     votes = np.bincount(labels[labels >= 0], minlength=len(scene.objects))
     share = votes / len(seeds)
     if not len(votes) or share.sum() < CONSTANTS.min_mask_majority / 2:
-        rows = scene.grown(seeds)
+        rows = _marked_part(scene, seeds, _visible(scene, view, ~mask)) if exact else scene.grown(seeds)
         if not len(rows):
             raise AffordanceError("shows only supports, no object.", field="mask", hint="mark an object")
         return Target(rows, None, "marked part", "place", 0.5, (_UNSEGMENTED,))
@@ -200,6 +205,48 @@ def _at_mask(scene: SegmentedMap, view: ObservedView, mask: NDArray[np.bool_], *
     return Target(found.rows, None, label, "place", score, (), k)
 
 
+def _at_masks(scene: SegmentedMap, hint: MasksHint) -> Target:
+    """Return the part of the map that more masks show than exclude, with the hidden Gaussians that belong to it.
+
+    Supports belong to no object. Segmented objects do not matter, because masks may separate objects that touch in the map.
+    """
+    shown, excluded = (np.zeros(len(scene.model), np.int32) for _ in range(2))
+    for one in hint.masks:
+        mask = _checked_mask(one.mask, one.view)
+        shown[_visible(scene, one.view, mask)] += 1
+        excluded[_visible(scene, one.view, ~mask)] += 1
+    if not shown.any():
+        raise AffordanceError("show nothing of the map.", field="masks", hint="mark an object in the images")
+    rows = _marked_part(scene, np.flatnonzero(shown > excluded), np.flatnonzero((excluded > 0) & (excluded >= shown)))
+    if not len(rows):
+        raise AffordanceError("show no object.", field="masks", hint="mark one object, in each image the same")
+    return Target(rows, None, "marked object", "place", 1.0, (_MARKED,))
+
+
+def _marked_part(scene: SegmentedMap, seeds: NDArray[np.int64], excluded: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the Gaussians that belong to marked ones, such as those of an object in a pile.
+
+    They are connected with the marked Gaussians, and nearer to them than to all excluded ones.
+
+    Args:
+        scene: the map; Gaussians of supports are left out.
+        seeds: rows of the marked Gaussians.
+        excluded: rows of Gaussians that are visible next to the mask.
+    """
+    own = seeds[scene.labels[seeds] >= -1]
+    if len(own) < SEGMENTATION.min_gaussians:
+        return own[:0]
+    low, high = np.percentile(scene.points[own], [2, 98], axis=0)
+    low, high = low - SEGMENTATION.seed_margin, high + SEGMENTATION.seed_margin
+    near = ((scene.points > low) & (scene.points < high)).all(axis=1)
+    rows = np.flatnonzero(scene.solid & (scene.labels >= -1) & near)
+    other = excluded[near[excluded]]
+    rows = _nearer(scene.points, rows, own, other) if len(other) else rows
+    connected = [rows[part] for part in clusters(scene.points[rows], apart=SEGMENTATION.object_distance)]
+    marked = [part for part in connected if np.isin(part, own).sum() >= CONSTANTS.min_marked_fraction * len(own)]
+    return np.sort(np.concatenate(marked)) if marked else own[:0]
+
+
 def _nearer(
     points: Array, rows: NDArray[np.int64], own: NDArray[np.int64], other: NDArray[np.int64]
 ) -> NDArray[np.int64]:
@@ -211,7 +258,7 @@ def _nearer(
 def _visible(scene: SegmentedMap, view: ObservedView, mask: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Return the rows of the solid Gaussians that are visible in the marked pixels."""
     c = view.camera
-    depth = render_view(scene.model, c, view.T_world_camera, "depth")
+    depth = render_view(scene.model, c, view.T_world_camera, "depth") if view.depth is None else view.depth
     rows = np.flatnonzero(scene.solid)
     at = transform_points(inverse(view.T_world_camera), scene.model.means.detach().double().numpy()[rows])
     rows, at = rows[at[:, 2] > 0.01], at[at[:, 2] > 0.01]
@@ -219,6 +266,13 @@ def _visible(scene: SegmentedMap, view: ObservedView, mask: NDArray[np.bool_]) -
     inside = (u >= 0) & (u < c.width) & (v >= 0) & (v < c.height)
     rows, at, u, v = rows[inside], at[inside], u[inside], v[inside]
     return rows[mask[v, u] & (np.abs(depth[v, u] - at[:, 2]) < CONSTANTS.max_distance)]
+
+
+def _checked_mask(mask: NDArray[np.bool_], view: ObservedView) -> NDArray[np.bool_]:
+    mask, shape = np.asarray(mask), (view.camera.height, view.camera.width)
+    if mask.shape != shape or mask.dtype != np.bool_:
+        raise InputError(f"is {mask.dtype} {mask.shape}.", field="mask", hint=f"give {shape} booleans")
+    return mask
 
 
 def _rectangle(hint: BoxHint) -> NDArray[np.bool_]:

@@ -47,7 +47,7 @@ def unknown_in_reach(run: RunFolder, log: Log, arm: RobotSpheres) -> UnknownSpac
     centers = arm.centers(q).reshape(-1, 3)
     box = np.array([centers.min(axis=0), centers.max(axis=0)])
     voxel = max(CONSTANTS.voxel, float((np.prod(box[1] - box[0]) / CONSTANTS.max_voxels) ** (1 / 3)))
-    return find_unknown(box, voxel, raw_views(run, log)[1])
+    return find_unknown(box, voxel, raw_views(run, log, masked=np.nan)[1])
 
 
 def obstacles(

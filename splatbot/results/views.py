@@ -64,12 +64,18 @@ def subsampled_views(run: RunFolder, log: Log) -> tuple[DepthView, ...]:
 
 
 def raw_views(
-    run: RunFolder, log: Log, most: int = CONSTANTS.max_frames_in_memory
+    run: RunFolder, log: Log, most: int = CONSTANTS.max_frames_in_memory, *, masked: float = 0.0
 ) -> tuple[list[int], tuple[DepthView, ...]]:
     """Return the frames of :func:`subsampled_views` with all depth that the sensor gave outside of masks, rectified.
 
     An audit must not use the filters of mapping: they remove thin objects as noise. Depth of another time than the pose
     would show errors that the map does not have.
+
+    Args:
+        run: folder of the run.
+        log: the log of the run, with the same masks.
+        most: largest number of frames.
+        masked: value of masked pixels [m], 0 or NaN.
 
     Returns:
         Positions in the log, and views.
@@ -83,8 +89,10 @@ def raw_views(
     views = []
     for index in indices:
         frame = rectified[index]
-        known = frame.valid if frame.mask is None else frame.valid & frame.mask
-        views.append(subsampled((np.where(known, frame.depth, np.float32(0)), frame.camera, poses[index])))
+        depth = np.where(frame.depth > 0, frame.depth, np.float32(0))
+        if frame.mask is not None:
+            depth = np.where(frame.mask, depth, np.float32(masked))
+        views.append(subsampled((depth, frame.camera, poses[index])))
     return indices, tuple(views)
 
 

@@ -23,8 +23,8 @@ from splatbot.grasping.options import GraspOptions
 from splatbot.grasping.types import Grasp
 from splatbot.protocols import Array, HandShape
 from splatbot.sim.scene import SceneObject
-from splatbot.sim.trials.scan import Rings, UnseenError, scan_scene
-from splatbot.sim.trials.scenes import make_trial
+from splatbot.sim.trials.scan import UnseenError, scan_scene
+from splatbot.sim.trials.scenes import ScanViews, make_trial
 from splatbot.sim.trials.stacks import GaussianStack
 from splatbot.sim.trials.surfaces import surfaces_of
 
@@ -81,9 +81,9 @@ def _contacts(seed: int) -> list[OneSidedContact]:
     trial = make_trial(seed, "tabletop")
     low, high = _ARCS[seed % len(_ARCS)]
     middle = (low + high) // 2
-    rings: Rings = ((40.0, (low, middle, high)), (50.0, (high, middle, low)))
+    views = ScanViews(((40.0, (low, middle, high)), (50.0, (high, middle, low))))
     try:
-        scan = scan_scene(trial, frames=24, rings=rings)
+        scan = scan_scene(trial, frames=24, viewpoints=views)
     except UnseenError:
         return []
     sampler = GaussianStack().sampler(scan, hand_only=True)
