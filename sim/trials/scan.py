@@ -31,7 +31,7 @@ from splatbot.sim.effects.registry import make_effects
 from splatbot.sim.rays import cast, pixel_rays
 from splatbot.sim.scene import SceneObject
 from splatbot.sim.solids import pose_at
-from splatbot.sim.trials.scenes import AROUND_TABLE, TABLE, TrialScene, ScanViews
+from splatbot.sim.trials.scenes import AROUND_TABLE, TABLE, ScanViews, TrialScene
 from splatbot.sim.trials.surfaces import surfaces_of
 from splatbot.sim.twin import Twin
 from splatbot.sim.wrist import T_PANDA_CAMERA, WristLog

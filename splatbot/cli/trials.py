@@ -34,6 +34,9 @@ def trials(
     succeeds if the hand lifts the object by 15 cm and still holds it after shaking. All stacks get the same frames at
     the same poses.
 
+    Isolated scenes have one object. Tabletop scenes have cups, tools and clutter, and a moving object in every fifth.
+    Packed scenes have upright objects 5 to 20 mm apart, bin scenes a pile, and shelf scenes objects below a board.
+
     In packed, bin and shelf scenes any object may be picked, the one with the best grasp. Exact masks mark the objects
     in every fourth frame. A tenth of the objects is black, another tenth glass; both lack depth.
 
@@ -50,8 +53,7 @@ def trials(
         splatbot trials --full --stacks gaussians mesh cloud --jobs 2 --out runs/trials
 
     Args:
-        scenes: tabletop has cups, tools and clutter, and a moving object in every fifth scene; isolated has one object.
-            packed has upright objects 5 to 20 mm apart, bin a pile, and shelf objects below a board.
+        scenes: kind of scenes, as above.
         trials: number of scenes; by default 50, or 27 with isolated objects.
         full: run 250 scenes.
         stacks: stacks to compare: gaussians, gaussians_look, mesh, cloud.

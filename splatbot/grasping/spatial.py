@@ -208,7 +208,7 @@ def _at_mask(scene: SegmentedMap, view: ObservedView, mask: NDArray[np.bool_], *
 def _at_masks(scene: SegmentedMap, hint: MasksHint) -> Target:
     """Return the part of the map that more masks show than exclude, with the hidden Gaussians that belong to it.
 
-    Supports belong to no object. Segmented objects do not matter, because masks may separate objects that touch in the map.
+    Supports belong to no object. Masks may separate objects that touch, so segmented objects do not matter.
     """
     shown, excluded = (np.zeros(len(scene.model), np.int32) for _ in range(2))
     for one in hint.masks:
