@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -30,10 +31,10 @@ def grasp(
     pixel: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="U V")] = None,
     point: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None,
     box: Annotated[tuple[float, float, float, float] | None, tyro.conf.arg(metavar="U0 V0 U1 V1")] = None,
-    mask: Annotated[Path | None, tyro.conf.arg(metavar="PNG")] = None,
+    mask: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="PNG ...")] = (),
     tag: Annotated[int | None, tyro.conf.arg(metavar="ID")] = None,
     vlm: bool = False,
-    index: Annotated[int, tyro.conf.arg(metavar="I")] = 0,
+    index: Annotated[tuple[int, ...], tyro.conf.arg(metavar="I ...")] = (0,),
     robot: str = "panda",
     base: Annotated[Pose | None, tyro.conf.arg(metavar="X Y Z QW QX QY QZ")] = None,
     hand_only: bool = False,
@@ -61,6 +62,7 @@ def grasp(
         splatbot grasp --map runs/latest --target "largest box"
         splatbot grasp --map runs/latest --target "red cup" --approach top
         splatbot grasp --map runs/latest --pixel 320 210 --index 12
+        splatbot grasp --map runs/latest --mask a.png b.png c.png --index 0 20 40
         SPLATBOT_VLM_URL=http://127.0.0.1:8000/v1 SPLATBOT_VLM_MODEL=qwen splatbot grasp --map runs/a --target mug --vlm
         splatbot grasp --map map.ply --base 0 0.4 0 0.7071 -0.7071 0 0 --point 0.1 0.2 0.6 --hand-only
 
@@ -70,11 +72,12 @@ def grasp(
         pixel: pixel in an image of the run.
         point: position on or in the object, in the frame of the map [m].
         box: corners of a rectangle in an image of the run [px].
-        mask: image of the same size that is not black at the object.
+        mask: image of the same size that is not black at the object. Several masks, each in another image, separate
+            objects that touch, as in a bin.
         tag: number of an AprilTag 36h11 on the object.
         vlm: also query the vision-language model of SPLATBOT_VLM_URL and SPLATBOT_VLM_MODEL; it and the rules must not
             contradict each other.
-        index: index of the image in the run, from 0.
+        index: index of the image in the run, from 0, for each mask.
         robot: its name, as of `splatbot robot list`.
         base: pose of the robot's base in the map; by default that of the scene.yaml next to the map (see
             `splatbot info --fit-plane`).
@@ -99,13 +102,16 @@ def grasp(
         out: folder to write to; by default runs/grasp.
     """
     places = {"--target": target, "--pixel": pixel, "--point": point, "--box": box, "--mask": mask, "--tag": tag}
-    given = [flag for flag, value in places.items() if value is not None]
+    given = [flag for flag, value in places.items() if value not in (None, ())]
     if len(given) != 1:
         raise InputError(f"are {len(given)}.", field=", ".join(places), hint="give one of them")
     if vlm and target is None:
         raise InputError("needs a name.", field="--vlm", hint="give --target too")
     map_file(map)
-    check_file(mask, "--mask")
+    for path in mask:
+        check_file(path, "--mask")
+    if len(index) != max(len(mask), 1):
+        raise InputError(f"are {len(index)} for {max(len(mask), 1)}.", field="--index", hint="give one for each mask")
     check_output(out)
 
     from splatbot.atomic import atomic_write
@@ -188,30 +194,33 @@ def graspable_objects(map_: Path, base: Pose | None) -> GraspableObjects:
 
 def _hint(
     map_: Path,
-    index: int,
+    index: tuple[int, ...],
     *,
     target: str | None,
     pixel: tuple[float, float] | None,
     point: tuple[float, float, float] | None,
     box: tuple[float, float, float, float] | None,
-    mask: Path | None,
+    mask: tuple[Path, ...],
     tag: int | None,
 ) -> Hint:
     import numpy as np
 
-    from splatbot.grasping.affordance import BoxHint, MaskHint, NameHint, PixelHint, PointHint, TagHint
+    from splatbot.grasping.affordance import BoxHint, MaskHint, MasksHint, NameHint, PixelHint, PointHint, TagHint
 
     if target is not None:
         return NameHint(target)
     if point is not None:
         return PointHint(np.array(point))
-    view = _view(map_, index)
+    views = _views(map_, index)
+    if len(mask) > 1:
+        return MasksHint(tuple(MaskHint(_read_mask(path), view) for path, view in zip(mask, views, strict=True)))
+    view = views[0]
     if pixel is not None:
         return PixelHint(*pixel, view)
     if box is not None:
         return BoxHint(*box, view)
-    if mask is not None:
-        return MaskHint(_read_mask(mask), view)
+    if mask:
+        return MaskHint(_read_mask(mask[0]), replace(view, depth=None))
     assert tag is not None
     return TagHint(tag, (view,))
 
@@ -226,8 +235,8 @@ def _read_mask(path: Path) -> NDArray[np.bool_]:
     return np.asarray(picture.reshape(*picture.shape[:2], -1).any(axis=2))
 
 
-def _view(map_: Path, index: int) -> ObservedView:
-    from dataclasses import replace
+def _views(map_: Path, indices: tuple[int, ...]) -> list[ObservedView]:
+    import numpy as np
 
     from splatbot.grasping.affordance import ObservedView
     from splatbot.results.folder import RunFolder
@@ -238,11 +247,15 @@ def _view(map_: Path, index: int) -> ObservedView:
     run = RunFolder(map_)
     poses = run.load_poses()
     log = reopen_log(run)
-    if index not in poses:
-        raise InputError(
-            f"is {index}, which has no pose.", field="--index", hint=f"one of {min(poses)}..{max(poses)} that has"
-        )
-    return ObservedView(replace(log.camera, distortion=()), poses[index], log[index].rgb)
+    camera, views = replace(log.camera, distortion=()), []
+    for index in indices:
+        if index not in poses:
+            hint = f"one of {min(poses)}..{max(poses)} that has"
+            raise InputError(f"is {index}, which has no pose.", field="--index", hint=hint)
+        frame = log[index]
+        depth = np.where(frame.valid, frame.depth, np.float32(0))
+        views.append(ObservedView(camera, poses[index], frame.rgb, depth))
+    return views
 
 
 def _audited(map_: Path, sampler: GraspSampler, target: Target) -> float:

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from splatbot.cli.drawing import draw_offscreen
 from splatbot.cli.paths import check_output
 
 
@@ -67,6 +68,8 @@ def trials(
         quiet: print only errors.
     """
     check_output(out)
+    if videos:
+        draw_offscreen()
 
     import json
 

@@ -24,8 +24,8 @@ class ObservedView:
         camera: undistorted pinhole camera.
         T_world_camera: (4, 4) pose of the camera.
         rgb: (H, W, 3) uint8 image for backends that use images. If None, the map is rendered.
-        depth: (H, W) measured depth [m], 0 where it is missing or shows the robot. Masks count only where it agrees with
-            the map. If None, the map is rendered.
+        depth: (H, W) measured depth [m], 0 where missing or at the robot. Masks count where it agrees with the map.
+            If None, the map is rendered.
     """
 
     camera: Camera

@@ -102,6 +102,25 @@ def test_probability_of_one_gaussian_is_exact_and_bounds_hold_by_simulation() ->
         collision_probability(one, sphere, -1.0)
 
 
+def test_space_is_suspect_where_a_third_of_the_views_lack_depth_and_not_under_a_mask() -> None:
+    camera, box = Camera(100.0, 100.0, 49.5, 49.5, 100, 100), [[-0.1, -0.1, 0.5], [0.1, 0.1, 0.7]]
+    wall, hole, masked = (np.full((100, 100), 1.0, np.float32) for _ in range(3))
+    hole[20:80, 20:80] = 0.0
+    masked[20:80, 20:80] = np.nan
+    near = np.full((100, 100), 0.53, np.float32)  # sees a surface in the first voxels
+    T = np.eye(4)
+
+    def suspect(*images: np.ndarray) -> bool:
+        return bool(find_unknown(box, 0.05, [(image, camera, T) for image in images]).suspect[2, 2, 0])
+
+    assert suspect(hole, hole)
+    assert not suspect(hole)  # one view is chance
+    assert not suspect(masked, masked, masked)  # the robot covers the view: it did not look
+    assert not suspect(hole, hole, wall)  # another view saw through it
+    assert suspect(hole, hole, *[near] * 4)
+    assert not suspect(hole, hole, *[near] * 5)  # too few of the views
+
+
 def test_what_a_wall_hides_is_unknown_and_blocks_only_if_it_is_to() -> None:
     camera = Camera(100.0, 100.0, 49.5, 49.5, 100, 100)
     depth = np.full((100, 100), 1.0, np.float32)  # a wall 1 m before the camera

@@ -17,6 +17,7 @@ from splatbot.grasping.affordance import (
     BoxHint,
     Hint,
     MaskHint,
+    MasksHint,
     NameHint,
     ObservedView,
     PixelHint,
@@ -26,6 +27,7 @@ from splatbot.grasping.affordance import (
 )
 from splatbot.grasping.language import LanguageAffordance
 from splatbot.grasping.spatial import SpatialAffordance, point_at
+from splatbot.rasterize.views import render_view
 from splatbot.segmentation import SegmentedMap, segment
 from tests.unit.grasping.objects import BALL, BIG, BOX, CAN, colored, scene, target_of
 
@@ -125,6 +127,84 @@ def test_a_mask_that_leaves_out_a_neighbour_means_the_larger_one_and_a_rough_one
     assert "is connected" in part.notes[0]
     whole = find_target(marked(0.42, 0.565), one, PLACE)
     np.testing.assert_array_equal(whole.rows, both.rows)
+
+
+LOW, HIGH = Block((0.45, 0.0, 0.03), (0.06, 0.06, 0.06)), Block((0.485, 0.055, 0.04), (0.06, 0.05, 0.08))
+AROUND = [
+    look_at(np.array([0.45 + 0.5 * np.cos(a), 0.5 * np.sin(a), 0.45]), np.array([0.46, 0.02, 0.03])) for a in range(6)
+]
+
+
+def touching() -> SegmentedMap:
+    """Two touching boxes, which are one cluster that is too large for an object."""
+    long = Block((0.45, -0.21, 0.03), (0.06, 0.36, 0.06))
+    return segment(colored({"low": LOW, "high": HIGH, "long": long}, 40_000, {}), np.eye(4), apart=0.012, cut=False)
+
+
+def silhouette(block: Block, others: list[Block], T_world_camera: np.ndarray) -> np.ndarray:
+    """Return the pixels (H, W) at which a box is in front of others, by rays against the slabs of each box."""
+    rays = (
+        CAMERA.backproject(np.ones((240, 320), np.float32)).reshape(-1, 3).astype(np.float64) @ T_world_camera[:3, :3].T
+    )
+    reach = []
+    for one in (block, *others):
+        low, high = np.array(one.center) - np.array(one.size) / 2, np.array(one.center) + np.array(one.size) / 2
+        with np.errstate(divide="ignore"):
+            a, b = ((side - T_world_camera[:3, 3]) / rays for side in (low, high))
+        enter, leave = np.minimum(a, b).max(axis=1), np.maximum(a, b).min(axis=1)
+        reach.append(np.where(enter < leave, enter, np.inf))
+    return (np.isfinite(reach[0]) & (reach[0] <= np.min(reach, axis=0))).reshape(240, 320)
+
+
+def test_masks_in_several_views_separate_objects_that_touch() -> None:
+    one = touching()
+    means = one.model.means.double().numpy()
+    for block, other in ((LOW, HIGH), (HIGH, LOW)):
+        masks = tuple(MaskHint(silhouette(block, [other], T), ObservedView(CAMERA, T)) for T in AROUND)
+        found = find_target(MasksHint(masks), one, PLACE)
+        own = (np.abs(block.distance(means)) < 2e-3) & (one.labels >= -1)
+        only = own & (np.abs(other.distance(means)) > 6e-3)
+        assert np.isin(found.rows, np.flatnonzero(own)).mean() > 0.9
+        assert np.isin(np.flatnonzero(only), found.rows).mean() > 0.8
+        assert "masks show" in found.notes[0]
+        alone = find_target(masks[0], one, PLACE)  # hidden sides are guessed from one view
+        assert np.isin(alone.rows, np.flatnonzero(own)).mean() > 0.8
+
+
+def test_masks_count_only_where_measured_depth_agrees() -> None:
+    """A mask that lacks the pixels behind the robot's arm excludes nothing there, if depth has a hole at the arm."""
+    one = touching()
+    hints = []
+    for T in AROUND:
+        mask = silhouette(LOW, [HIGH], T)
+        view = find_depth(one, T)
+        arm = np.zeros_like(mask)
+        arm[:, : int(np.nonzero(mask)[1].mean())] = True  # the arm covers half of the object
+        hints.append(MaskHint(mask & ~arm, ObservedView(CAMERA, T, None, np.where(arm, np.float32(0), view))))
+    seen = find_target(MasksHint(tuple(hints)), one, PLACE)
+    blind = find_target(
+        MasksHint(tuple(MaskHint(h.mask, ObservedView(CAMERA, h.view.T_world_camera)) for h in hints)), one, PLACE
+    )
+    own = np.flatnonzero((np.abs(LOW.distance(one.model.means.double().numpy())) < 2e-3) & (one.labels >= -1))
+    assert np.isin(own, seen.rows).mean() > 0.7
+    assert np.isin(own, blind.rows).mean() < np.isin(own, seen.rows).mean() - 0.1
+
+
+def find_depth(one: SegmentedMap, T_world_camera: np.ndarray) -> np.ndarray:
+    return render_view(one.model, CAMERA, T_world_camera, "depth")
+
+
+def test_masks_of_the_table_or_of_nothing_are_refused() -> None:
+    sky, table = np.zeros((240, 320), bool), np.zeros((240, 320), bool)
+    sky[:3, :3] = True
+    u, v = (round(x) for x in _pixel((0.30, -0.05, 0.0)))
+    table[v - 5 : v + 6, u - 5 : u + 6] = True
+    away = ObservedView(CAMERA, look_at(np.array([0.0, -0.4, 0.6]), np.array([-5.0, -9.0, 3.0])))
+    for mask, view, message in ((sky, away, "nothing of the map"), (table, VIEW, "no object")):
+        with pytest.raises(AffordanceError, match=message):
+            find_target(MasksHint((MaskHint(mask, view),)), scene(), PLACE)
+    with pytest.raises(InputError, match="booleans"):
+        find_target(MasksHint((MaskHint(np.ones((2, 2), bool), VIEW),)), scene(), PLACE)
 
 
 def test_the_table_is_no_target() -> None:
