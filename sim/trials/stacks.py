@@ -11,7 +11,9 @@ import numpy as np
 import torch
 
 from splatbot.collision import GaussianCollisionField, RobotSpheres, find_moving, gather_evidence
+from splatbot.collision.moving import with_balls
 from splatbot.config import SensorConfig
+from splatbot.gaussians import GaussianModel
 from splatbot.grasping.affordance import AffordanceError, Hint, Target, find_target
 from splatbot.grasping.measured import RawDepth
 from splatbot.grasping.options import GraspOptions
@@ -49,6 +51,9 @@ class StackConstants:
 CONSTANTS = StackConstants()
 
 
+_WORKSPACE = np.array(
+    [[-2.0, -2.0, -0.2], [2.0, 2.0, 0.35]]
+)  # [m] of segmentation, from the base; below the shelf's board
 SENSOR = SensorConfig()  # noise of depth that confirms a point
 OPTIONS = PickOptions(lift=CONSTANTS.lift, budget_ms=CONSTANTS.budget_ms, tries=8, grasp=GraspOptions())
 
@@ -91,9 +96,9 @@ class Stack(Protocol):
 class GaussianStack:
     """The Gaussians of the map, with certified paths.
 
-    The way to the pre-grasp has the obstacles of ``splatbot plan``: the map at 2 sigma and its support plane. A scene
-    with places of motion has these instead. Unknown space is free: of space near the camera's path few views decide,
-    and the holes of the simulated depth would close it.
+    The way to the pre-grasp has the obstacles of ``splatbot plan``: the map at 2 sigma, its support plane, and places
+    of motion where that is possible. Unknown space is free: of space near the camera's path few views decide, and the
+    holes of the simulated depth would close it.
     """
 
     name = "gaussians"
@@ -103,8 +108,7 @@ class GaussianStack:
         """Implement :meth:`Stack.learn`."""
         begin = time.perf_counter()
         sampler = self.sampler(scan)
-        if sampler.moving is None:
-            _agree_with_plans(sampler, scan)
+        _agree_with_plans(sampler)
         return self.known(scan, sampler, begin)
 
     def known(self, scan: TrialScan, sampler: GraspSampler, begin: float) -> StackMap:
@@ -122,7 +126,7 @@ class GaussianStack:
         solid = np.flatnonzero(~evidence.seen_through)
         moving = find_moving(scan.snapshot.model, evidence)
         return GraspSampler(
-            segment(scan.snapshot.model.select(torch.from_numpy(solid)), scan.T_world_base, cut=False),
+            segment(scan.snapshot.model.select(torch.from_numpy(solid)), scan.T_world_base, box=_WORKSPACE, cut=False),
             panda(),
             hand_only=hand_only,
             observers=scan.observers[solid],
@@ -134,22 +138,23 @@ class GaussianStack:
         )
 
 
-def _agree_with_plans(sampler: GraspSampler, scan: TrialScan) -> None:
+def _agree_with_plans(sampler: GraspSampler) -> None:
     """Give a sampler the obstacles of plans from the home configuration of its robot."""
-    T, model, support = sampler.scene.T_world_base, sampler.scene.model, sampler.scene.support
+    T, support = sampler.scene.T_world_base, sampler.scene.support
     arm = RobotSpheres(panda(), T_world_base=T)
     plane = None
     if support is not None:
         normal = T[:3, :3] @ support.normal
         plane = np.append(normal, -support.offset - normal @ T[:3, 3])
-    around = PlanObstacles(
-        GaussianCollisionField(model, min_observations=CONSTANTS.min_observations),
-        model,
-        arm,
-        panda().home,
-        plane=plane,
-    )
-    sampler.agree_with_plans(around.field(CONSTANTS.margin))
+
+    def around(model: GaussianModel) -> GaussianCollisionField:
+        obstacles = PlanObstacles(GaussianCollisionField(model), model, arm, panda().home, plane=plane)
+        return obstacles.field(CONSTANTS.margin)
+
+    model, avoiding = sampler.scene.model, None
+    if sampler.moving is not None:
+        avoiding = around(with_balls(model, sampler.moving, n_sigma=2.0, observations=CONSTANTS.min_observations))
+    sampler.agree_with_plans(around(model), avoiding=avoiding)
 
 
 class LookingStack(GaussianStack):

@@ -252,14 +252,12 @@ class _Watched(TwinController):
     """A twin's controller that records the contacts of its arm."""
 
     def __init__(self, twin: Twin, watch: Watch | None) -> None:
-        self._contacts, self._periods, self._watch = ContactMonitor(twin.world), 0, watch
-        super().__init__(twin)
+        self._contacts, self._periods = ContactMonitor(twin.world), 0
+        super().__init__(twin, watch=watch)
 
     def _advance(self, q: Array, velocity: Array, acceleration: Array) -> None:
         super()._advance(q, velocity, acceleration)
         self._periods += 1
-        if self._watch is not None:
-            self._watch(self.twin.data, self._clock)
         if self._periods % CONSTANTS.contact_period == 0:
             self._contacts.update(self.twin.data, self._clock)
 

@@ -129,12 +129,12 @@ class MapPickPlanner:
         options: options of the pick.
 
     Raises:
-        InputError: the sampler has regions of motion and agrees with plans, whose obstacles do not include them.
+        InputError: the sampler has regions of motion and agrees with plans, but without a field that includes both.
     """
 
     def __init__(self, sampler: GraspSampler, target: Target, options: PickOptions) -> None:
-        if sampler.departure is not None and sampler.moving is not None:
-            hint = "leave `moving` out, or do not call agree_with_plans"
+        if sampler.departure is not None and sampler.moving is not None and sampler.departure_avoiding is None:
+            hint = "give `avoiding` to agree_with_plans, or leave `moving` out"
             raise InputError("has regions of motion and agrees with plans.", field="sampler", hint=hint)
         self.s, self.o = sampler, options
         self._T = sampler.scene.T_world_base
@@ -149,7 +149,8 @@ class MapPickPlanner:
         self._avoiding_moving: _Obstacles | None = None
         if sampler.moving is not None:
             models = (sampler.scene.model, around, around_held)
-            self._avoiding_moving = _Obstacles(*(field(model, avoid_moving=True) for model in models))
+            whole, without, held = (field(model, avoid_moving=True) for model in models)
+            self._avoiding_moving = _Obstacles(sampler.departure_avoiding or whole, without, held)
 
     def plan_to(self, grasp: Grasp, start: Array, *, avoid_moving: bool = False) -> PickPlan | str:
         """Plan a pick; see :class:`PickPlanner`."""

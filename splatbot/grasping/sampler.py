@@ -78,21 +78,29 @@ class GraspSampler:
         self.hand = hand_of(robot)
         self.margin, self.arm_margin, self.n_sigma = margin, arm_margin, n_sigma
         self.departure: GaussianCollisionField | None = None
+        self.departure_avoiding: GaussianCollisionField | None = None
         self.unknown: GaussianCollisionField | None = None
         self.moving = None if moving is None or not len(moving) else np.asarray(moving, dtype=np.float64)
         self.min_observations = min_observations
         self.field = self.collision_field(scene.model)
         self._make_reach = None if hand_only else make_reach or self._arm_reach
 
-    def agree_with_plans(self, field: GaussianCollisionField, unknown: GaussianCollisionField | None = None) -> None:
+    def agree_with_plans(
+        self,
+        field: GaussianCollisionField,
+        unknown: GaussianCollisionField | None = None,
+        *,
+        avoiding: GaussianCollisionField | None = None,
+    ) -> None:
         """Offer only grasps whose pre-grasp a plan may end at.
 
         Args:
             field: collision field of plans, with all their obstacles.
             unknown: field of unknown space alone, which the links before the hand avoid on the approach. If None, it
                 counts as free.
+            avoiding: ``field`` with the regions where motion was observed. If None, no such regions are known.
         """
-        self.departure, self.unknown = field, unknown
+        self.departure, self.unknown, self.departure_avoiding = field, unknown, avoiding
 
     def sample(self, target: Target, options: GraspOptions | None = None) -> GraspResult:
         """Sample ranked grasps of a target; a result without grasps holds the reasons.

@@ -124,3 +124,13 @@ def test_a_model_needs_a_target_name_and_a_model_name(
     answer = run("grasp", "--map", map_file, *BASE, "--point", 0, 0, 0, "--vlm")
     assert answer.code == 2
     assert "--target" in answer.err
+
+
+def test_several_masks_need_as_many_images(run: RunCommand, map_file: Path, tmp_path: Path) -> None:
+    masks = [tmp_path / f"{name}.png" for name in ("a", "b")]
+    for path in masks:
+        assert cv2.imwrite(str(path), np.full((4, 4), 255, np.uint8))
+    answer = run("grasp", "--map", map_file, *BASE, "--mask", *masks, "--index", 3)
+    assert_refused(answer, "--index: are 1 for 2. Fix: give one for each mask")
+    answer = run("grasp", "--map", map_file, *BASE, "--mask", masks[0], tmp_path / "gone.png", "--index", 3, 4)
+    assert_refused(answer, "gone.png")
