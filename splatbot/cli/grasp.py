@@ -96,7 +96,8 @@ def grasp(
         unknown: space that no frame of the run saw to be empty, as in `splatbot plan`. Arm and hand avoid it at the
             pre-grasp, and the arm on the approach; --accept-implied decides on fingers there.
         n_sigma: surface of a Gaussian, in standard deviations; smaller than for planning, because the hand comes close.
-        min_observations: least number of keyframes that support a Gaussian; others are ignored.
+        min_observations: least number of keyframes that support a Gaussian; others are ignored. A surface that few
+            keyframes observed is then no obstacle for the arm either.
         seed: seed of the search.
         verbose: print the terms of the scores; without a grasp, the counts of each reason.
         out: folder to write to; by default runs/grasp.

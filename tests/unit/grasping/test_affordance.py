@@ -136,7 +136,7 @@ AROUND = [
 
 
 def touching() -> SegmentedMap:
-    """Two touching boxes, which are one cluster that is too large for an object."""
+    """Return two touching boxes, which are one cluster that is too large for an object."""
     long = Block((0.45, -0.21, 0.03), (0.06, 0.36, 0.06))
     return segment(colored({"low": LOW, "high": HIGH, "long": long}, 40_000, {}), np.eye(4), apart=0.012, cut=False)
 
