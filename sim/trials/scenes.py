@@ -88,14 +88,12 @@ CONSTANTS = SceneConstants()
 Area = tuple[tuple[float, float], tuple[float, float]]
 _TABLE_AREA: Area = ((0.36, -0.26), (0.64, 0.26))  # [m] corners of the area with objects
 _PACKED_AREA: Area = ((0.42, -0.13), (0.60, 0.13))
-_SHELF_AREA: Area = ((0.63, -0.22), (0.74, 0.22))
+_SHELF_AREA: Area = ((0.65, -0.22), (0.75, 0.22))
 _BIN_CENTER, _BIN_SIZE, _BIN_WALL = (0.48, 0.0), (0.36, 0.48, 0.07), 0.012  # [m] inside; thickness of the walls
 _REACH = ((0.52, 0.0), (0.54, 0.8))  # [m] centre and size of the area in reach
-_SHELF_FRONT, _SHELF_SIZE, _SHELF_BOARD = 0.59, (0.26, 0.72, 0.42), 0.018  # [m] x of the front; inside; boards
+_SHELF_FRONT, _SHELF_SIZE, _SHELF_BOARD = 0.62, (0.26, 0.72, 0.42), 0.018  # [m] x of the front; inside; boards
 _FROM_FRONT = ScanViews(
-    ((22.0, (125, 150, 180, -150, -125)), (38.0, (-125, -150, 180, 150, 125)), (62.0, (150, 180, -150))),
-    (0.68, 0.0, 0.15),
-    0.6,
+    ((24.0, (130, 150, 180, -150, -130)), (40.0, (-130, -150, 180, 150, 130))), (0.71, 0.0, 0.12), 0.68
 )
 
 
