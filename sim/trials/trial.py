@@ -68,6 +68,7 @@ class Failure(StrEnum):
     PLAN = "plan"  # no path was found
     SLIP = "slip"  # the object was held, and fell
     COLLISION = "collision"  # another object was in contact before
+    LOOK = "look"  # the look from the wrist did not find the target, or found the way obstructed
     CONTROL = "control"  # the arm did not follow the motion
 
 
@@ -291,6 +292,8 @@ def _failure(result: PickResult, touched: tuple[str, ...], mistaken: bool) -> Fa
         return Failure.PLAN
     if set(touched) - {TABLE}:
         return Failure.COLLISION
+    if result.outcome in (PickOutcome.TARGET_MOVED, PickOutcome.OBSTRUCTED):
+        return Failure.LOOK
     if result.outcome is PickOutcome.NOTHING_HELD:
         return Failure.GRASP
     if result.outcome is PickOutcome.LOST or result.outcome is PickOutcome.PICKED:

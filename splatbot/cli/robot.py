@@ -47,7 +47,7 @@ def robot(
     Args:
         action: the action.
         name: a robot's name; for add, the file, or a shipped arm that gets a hand.
-        out: the file to write; mjcf prints without one. info --check-meshes draws NAME-body.png by default, and fit
+        out: the file to write; mjcf prints without one. info --check-meshes draws runs/robot/NAME-body.png, and fit
             writes NAME.json.
         tip: add: the link at the arm's end (MJCF: a body or site); by default the last one before fingers.
         slack: largest distance of the spheres beyond the geometry [m]; for fit panda 0.011 by default. By default add
@@ -143,7 +143,8 @@ def _check_meshes(name: str, out: Path | None) -> int:
             for p in checks
         ]
     )
-    picture = out if out is not None else Path(f"{name}-body.png")
+    picture = out if out is not None else Path("runs") / "robot" / f"{name}-body.png"
+    picture.parent.mkdir(parents=True, exist_ok=True)
     draw_parts(parts, picture)
     print(f"picture: {picture}")
     return 0 if max(p.uncovered for p in checks) <= 0 else 1

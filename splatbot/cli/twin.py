@@ -216,7 +216,7 @@ def _print(result: TwinResult, entries: list[LedgerEntry], written: list[Path]) 
     for text in result.warnings:
         console.print(f"[yellow]warning: {text}[/yellow]")
     table = Table("effect", "on", "why", "ms", "us a step")
-    for entry in entries:
+    for entry in sorted(entries, key=lambda entry: not entry.on):  # active ones first
         cost = ("", "") if entry.ms is None else (f"{entry.ms:+.1f}", f"{entry.us_per_step:+.2f}")
         if entry.on or entry.observable or entry.by != "scene":  # leaves out effects that no sensor names
             table.add_row(entry.name, "on" if entry.on else "-", entry.why, *cost)

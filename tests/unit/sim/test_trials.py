@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from splatbot.errors import FormatError, InputError
+from splatbot.grasping.pick_types import PickOutcome, PickResult, PickStage
 from splatbot.logs.raycast import RaycastSurface
 from splatbot.robots.panda import panda
 from splatbot.sim.compare.agreement import wilson
@@ -27,7 +28,7 @@ from splatbot.sim.trials.stacks import GaussianStack
 from splatbot.sim.trials.surfaces import surfaces_of
 from splatbot.sim.trials.table import physics, summaries, table_rows
 from splatbot.sim.trials.trial import CONSTANTS as TRIAL
-from splatbot.sim.trials.trial import TrialRow, TwinPickResult, run_trial
+from splatbot.sim.trials.trial import TrialRow, TwinPickResult, _failure, _Watched, run_trial
 from splatbot.sim.twin import Twin
 from splatbot.sim.wrist import T_PANDA_CAMERA
 
@@ -274,3 +275,18 @@ def _runs(pid: int) -> bool:
         return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
     except (FileNotFoundError, ProcessLookupError):
         return False
+
+
+def test_a_film_of_a_pick_gets_every_control_period() -> None:
+    seen: list[float] = []
+    twin = Twin(make_trial(1, "isolated").scene)
+    controller = _Watched(twin, lambda data, time: seen.append(time))
+    q = panda().home
+    for _ in range(3):
+        controller._advance(q, 0 * q, 0 * q)
+    assert len(seen) == 3
+
+
+@pytest.mark.parametrize(("outcome", "failure"), [("TARGET_MOVED", "look"), ("OBSTRUCTED", "look"), ("LOST", "slip")])
+def test_a_failed_look_is_no_failure_of_control(outcome: str, failure: str) -> None:
+    assert _failure(PickResult(PickOutcome[outcome], PickStage.CHECK, "it is away", None, ()), (), False) == failure
