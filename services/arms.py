@@ -38,7 +38,7 @@ def known_robot(name: str) -> RobotModel:
         InputError: the name is unknown.
     """
     if name not in robot_names():
-        raise InputError(f"is {name[:80]!r}.", field="robot", hint=f"robots: {', '.join(robot_names())}")
+        raise InputError(f"there is no robot {name[:80]!r}.", field="robot", hint=f"robots: {', '.join(robot_names())}")
     return load_robot(name)
 
 
