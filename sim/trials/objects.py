@@ -1,4 +1,4 @@
-"""Objects of trial scenes: primitives, hollow cups, mallets, and twenty household shapes of convex parts."""
+"""Objects of trial scenes: primitives, hollow cups, mallets, and household shapes of convex parts."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ from splatbot.errors import FormatError, InputError, SplatbotError
 from splatbot.sim.picking import MOST_MOVED
 from splatbot.sim.trials.scenes import FAMILIES, make_trial
 from splatbot.sim.trials.stacks import GaussianStack, LookingStack, Stack
-from splatbot.sim.trials.trial import TrialRow, run_trial
+from splatbot.sim.trials.trial import VERSION, TrialRow, run_trial
 
 FILE = "trials.jsonl"
 STACKS = ("gaussians", "gaussians_look", "mesh", "cloud")
@@ -107,9 +107,9 @@ def run_trials(
     """
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / FILE
-    # Rows of another scan resolution or another push belong to other trials, and stay in the file.
-    own = (plan.frames, plan.width, plan.moved)
-    same = (row for row in read_rows(path) if (row.frames, row.pixels, row.moved) == own)
+    # Rows of another version, scan resolution or push belong to other trials, and stay in the file.
+    own = (plan.frames, plan.width, plan.moved, VERSION)
+    same = (row for row in read_rows(path) if (row.frames, row.pixels, row.moved, row.version) == own)
     done = {(row.family, row.seed, row.stack): row for row in same}
     for name in plan.stacks:
         stack_of(name)

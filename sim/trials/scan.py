@@ -31,7 +31,7 @@ from splatbot.sim.effects.registry import make_effects
 from splatbot.sim.rays import cast, pixel_rays
 from splatbot.sim.scene import SceneObject
 from splatbot.sim.solids import pose_at
-from splatbot.sim.trials.scenes import AROUND_TABLE, TABLE, ScanViews, TrialScene
+from splatbot.sim.trials.scenes import ANY_TARGET, AROUND_TABLE, TABLE, ScanViews, TrialScene
 from splatbot.sim.trials.surfaces import surfaces_of
 from splatbot.sim.twin import Twin
 from splatbot.sim.wrist import T_PANDA_CAMERA, WristLog
@@ -91,8 +91,7 @@ class TrialScan:
         T_world_base: (4, 4) by the joints at the first frame.
         snapshot: of the map.
         observers: (N, 3) camera position that first observed each Gaussian [m, world]; NaN if unknown.
-        hints: marks of the target and of the other candidates, each in one frame; a candidate that no frame shows is
-            left out.
+        hints: marks of the target and of the other candidates; a candidate that no frame shows is left out.
         seconds: of mapping.
     """
 
@@ -149,7 +148,7 @@ def scan_scene(
     true = log.ground_truth.T_world_camera
     rng = np.random.default_rng(trial.seed)
     sigma = np.repeat(CONSTANTS.pose_sigma, 3)
-    error = np.zeros(6) if calibrated else np.repeat(CONSTANTS.calibration_sigma, 3) * _calibration_draw(trial.seed)
+    error = np.zeros(6) if calibrated else calibration_error(trial.seed)
     prior_poses = np.stack([T @ se3_exp(error) @ se3_exp(sigma * rng.standard_normal(6)) for T in true])
     mask = SelfMask(log.robot, T_PANDA_CAMERA)
     assert trial.scene.camera is not None
@@ -228,31 +227,38 @@ def _with_materials(trial: TrialScene, log: WristLog, joints: Array) -> Callable
 
     Both lose depth in blobs. The other pixels of glass measure the surface behind it.
     """
-    names = {material: [n for n, m in trial.materials.items() if m == material] for material in ("black", "glass")}
-    logs = {m: _log(trial, joints, log.camera.width, found) for m, found in names.items() if found}
-    holes = {
-        material: DepthHoles(share=share, size=CONSTANTS.hole_size)
-        for material, share in zip(names, CONSTANTS.holes, strict=True)
-    }
+    glass, black = ([name for name, found in trial.materials.items() if found == m] for m in ("glass", "black"))
+    solid = _log(trial, joints, log.camera.width, glass) if glass else log
+    bare = _log(trial, joints, log.camera.width, (*glass, *black)) if black else solid
 
     def read(k: int) -> Frame:
-        frame = log[k]
-        depth = frame.depth.copy()
-        for number, (material, bare) in enumerate(logs.items()):
-            behind = bare[k].depth
-            own = (frame.depth > 0) & ((behind == 0) | (behind > frame.depth + 1e-6))
-            rng = np.random.default_rng((trial.seed, k, number))
-            seen = own & (holes[material].apply(replace(frame, depth=np.where(own, frame.depth, 0)), rng).depth > 0)
-            depth[own & ~seen] = 0.0
-            if material == "glass":
-                depth[seen] = behind[seen]
-        return replace(frame, depth=depth)
+        depth = solid[k].depth.copy()
+        depth[_nearer(depth, bare[k].depth) & ~_measured(solid[k], bare[k], CONSTANTS.holes[0], (trial.seed, k, 0))] = (
+            0.0
+        )
+        clear = _nearer(log[k].depth, solid[k].depth)
+        depth[clear & ~_measured(log[k], solid[k], CONSTANTS.holes[1], (trial.seed, k, 1))] = 0.0
+        return replace(log[k], depth=depth)
 
     return read
 
 
-def _calibration_draw(seed: int) -> Array:
-    return np.random.default_rng((seed, zlib.crc32(b"calibration"))).standard_normal(6)
+def _nearer(depth: NDArray[np.float32], behind: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Return the pixels (H, W) at which a scene is nearer than the same scene without some objects."""
+    return (depth > 0) & ((behind == 0) | (behind > depth + 1e-6))
+
+
+def _measured(frame: Frame, bare: Frame, holes: float, seed: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Return the pixels (H, W) of the objects that only ``frame`` shows whose depth a camera measures."""
+    own = replace(frame, depth=np.where(_nearer(frame.depth, bare.depth), frame.depth, np.float32(0)))
+    effect = DepthHoles(share=holes, size=CONSTANTS.hole_size)
+    return effect.apply(own, np.random.default_rng(seed)).depth > 0
+
+
+def calibration_error(seed: int) -> Array:
+    """Draw the error (6,) [m, rad] of the hand-eye transform of a trial, which is constant in its scan."""
+    rng = np.random.default_rng((seed, zlib.crc32(b"calibration")))
+    return np.repeat(CONSTANTS.calibration_sigma, 3) * rng.standard_normal(6)
 
 
 def _pose_on_path(obj: SceneObject, t: float) -> Array:
@@ -286,7 +292,7 @@ def _hints(trial: TrialScene, log: WristLog, frames: Sequence[Frame], poses: Arr
                 shown.setdefault(name, []).append((k, shows))
     if not shown:
         raise UnseenError("is in no picture.", field=trial.target, hint="give another seed")
-    if not trial.others:
+    if trial.family not in ANY_TARGET:
         measured = [(k, shows & (usable_depth(frames[k]) > 0)) for k, shows in shown[trial.target]]
         k, shows = max(measured, key=lambda one: int(one[1].sum()))
         return {trial.target: _click_hint(frames[k], poses[k], shows)}

@@ -29,6 +29,8 @@ from splatbot.sim.twin import Twin
 from splatbot.sim.world import OBJECT
 
 FAMILIES = ("tabletop", "isolated", "packed", "bin", "shelf")
+ANY_TARGET = ("packed", "bin", "shelf")
+"""Families in which any object may be picked."""
 TABLE, OBSTACLE, BIN, SHELF = "table", "obstacle", "bin", "shelf"
 SENSOR = ("depth_noise", "depth_holes:share=0.05")
 Material = Literal["black", "glass"]
@@ -115,7 +117,7 @@ class TrialScene:
         seed: of this scene.
         family: of :data:`FAMILIES`.
         moving: whether an obstacle moves through the scene.
-        others: kinds of objects by name that may be picked instead, if they have a better grasp.
+        others: kinds by name of objects that may be picked instead, if they have a better grasp (:data:`ANY_TARGET`).
         materials: material of each object that a depth camera measures badly.
         viewpoints: of the scan.
     """
@@ -137,13 +139,13 @@ def make_trial(seed: int, family: str = "tabletop") -> TrialScene:
     Physics brings all objects to rest before the scan. The protocols:
 
     - isolated: one object, of six convex kinds and the household shapes in turn.
-    - tabletop: four to seven objects, 2 to 5 cm apart, and a moving obstacle in every fifth scene.
-    - packed: five to eight upright objects, 5 to 20 mm apart.
-    - bin: six to nine objects that fell into a bin of 36 x 48 x 7 cm.
-    - shelf: three to five objects in a shelf with a back, sides and a board above them, open to the robot.
+    - tabletop: up to seven objects, at least 2 to 5 cm apart, and a moving obstacle in every fifth scene.
+    - packed: up to eight objects as they stand, at least 5 to 20 mm apart.
+    - bin: up to nine objects that fell into a bin of 36 x 48 x 7 cm.
+    - shelf: up to five objects in a shelf with a back, sides and a board above them, open to the robot.
 
-    In the last three, any object may be picked, as in the protocols of VGN (Breyer et al. 2020). A tenth of their
-    objects is black, another tenth glass. Glass is never a target.
+    In the last three, any object may be picked, as in the protocols of VGN (Breyer et al. 2020). Each of their
+    objects but the first is black with a probability of 0.1, and glass with the same. Glass is never a target.
 
     Raises:
         InputError: the family is unknown.
@@ -151,9 +153,7 @@ def make_trial(seed: int, family: str = "tabletop") -> TrialScene:
     if family not in FAMILIES:
         raise InputError(f"is {family!r}.", field="scenes", hint=f"one of {', '.join(FAMILIES)}")
     rng = np.random.default_rng((FAMILIES.index(family), seed))
-    if family in ("tabletop", "isolated"):
-        return _one_target(seed, family, rng)
-    return _any_target(seed, family, rng)
+    return _any_target(seed, family, rng) if family in ANY_TARGET else _one_target(seed, family, rng)
 
 
 def _one_target(seed: int, family: str, rng: np.random.Generator) -> TrialScene:
@@ -184,6 +184,8 @@ def _any_target(seed: int, family: str, rng: np.random.Generator) -> TrialScene:
     settled = _without_lost(_settled(scene, settling_time))
     kept = {obj.name for obj in settled.movable}
     kinds = {str(value["name"]): item.kind for item, value in placed if value["name"] in kept}
+    if all(materials.get(name) == "glass" for name in kinds):
+        materials.pop(next(iter(kinds)))  # one object remains to be picked
     candidates = {name: kind for name, kind in kinds.items() if materials.get(name) != "glass"}
     first = str(rng.choice(list(candidates)))
     others = {name: kind for name, kind in candidates.items() if name != first}
@@ -225,7 +227,7 @@ _UPRIGHT = ("bottle", "mug", "spray bottle", "drill", "pear", "bear", "camera", 
 
 
 def _upright(rng: np.random.Generator) -> TrialObject:
-    """Return an object that is at least as high as wide, as in the packed scenes of VGN."""
+    """Return an object that stands, as in the packed scenes of VGN."""
     if rng.random() < 0.5:
         return household(str(rng.choice(_UPRIGHT)), rng)
     return (can, box, cup)[int(rng.integers(3))](rng)

@@ -65,7 +65,7 @@ class StackMap:
     Args:
         scene: its segmented surface.
         planners: returns the grasp sampler and the pick planner for a target.
-        world_bytes: size of the representation used for planning [bytes].
+        world_bytes: size of the map and its collision field [bytes].
         seconds: build time [s].
     """
 
@@ -165,7 +165,8 @@ class LookingStack(GaussianStack):
 
     def learn(self, scan: TrialScan) -> StackMap:
         """Implement :meth:`Stack.learn` without the obstacles of plans, which do not follow a target that moved."""
-        return self.known(scan, self.sampler(scan), time.perf_counter())
+        begin = time.perf_counter()
+        return self.known(scan, self.sampler(scan), begin)
 
 
 @dataclass(frozen=True, eq=False)

@@ -52,6 +52,9 @@ class TrialConstants:
 
 CONSTANTS = TrialConstants()
 
+VERSION = 2
+"""Version of scenes and physics of trials. A change that gives a seed another scene or twin increases it."""
+
 HELD_OUT = Spread(engine=True)
 """Physics of the held-out twin. The ranges were chosen before any trial ran with them."""
 
@@ -114,6 +117,7 @@ class TrialRow:
         width_mm: of the grasp [mm]. If None, there was no grasp.
         frames, pixels: number of frames of the scan, and their width [px].
         moved: distance by which the target was pushed aside after the scan [m].
+        version: of scenes and physics, :data:`VERSION`. Rows of another one are no results of these trials.
     """
 
     seed: int
@@ -131,6 +135,7 @@ class TrialRow:
     frames: int
     pixels: int
     moved: float = 0.0
+    version: int = 1
 
     def to_dict(self) -> dict[str, Any]:
         """Return the row as values for JSON; the held-out twin is ``reality`` there."""
@@ -345,4 +350,5 @@ def _row(
         width_mm=None if result is None or result.grasp is None else 1e3 * result.grasp.width,
         frames=scan[0],
         pixels=scan[1],
+        version=VERSION,
     )

@@ -221,7 +221,7 @@ def _hint(
     if box is not None:
         return BoxHint(*box, view)
     if mask:
-        return MaskHint(_read_mask(mask[0]), replace(view, depth=None))
+        return MaskHint(_read_mask(mask[0]), view)
     assert tag is not None
     return TagHint(tag, (view,))
 
@@ -241,6 +241,7 @@ def _views(map_: Path, indices: tuple[int, ...]) -> list[ObservedView]:
 
     from splatbot.grasping.affordance import ObservedView
     from splatbot.results.folder import RunFolder
+    from splatbot.results.views import rectified_log
     from splatbot.robots.in_view import reopen_log
 
     if not map_.is_dir():
@@ -253,9 +254,11 @@ def _views(map_: Path, indices: tuple[int, ...]) -> list[ObservedView]:
         if index not in poses:
             hint = f"one of {min(poses)}..{max(poses)} that has"
             raise InputError(f"is {index}, which has no pose.", field="--index", hint=hint)
-        frame = log[index]
-        depth = np.where(frame.valid, frame.depth, np.float32(0))
-        views.append(ObservedView(camera, poses[index], frame.rgb, depth))
+        depth = None
+        if len(indices) > 1:  # several masks are compared with the depth that the run mapped
+            mapped = rectified_log(run, log)[index]
+            depth = np.where(mapped.valid, mapped.depth, np.float32(0))
+        views.append(ObservedView(camera, poses[index], log[index].rgb, depth))
     return views
 
 

@@ -36,10 +36,10 @@ def trials(
     the same poses.
 
     Isolated scenes have one object. Tabletop scenes have cups, tools and clutter, and a moving object in every fifth.
-    Packed scenes have upright objects 5 to 20 mm apart, bin scenes a pile, and shelf scenes objects below a board.
+    Packed scenes have standing objects with small gaps, bin scenes a pile, and shelf scenes objects below a board.
 
     In packed, bin and shelf scenes any object may be picked, the one with the best grasp. Exact masks mark the objects
-    in every fourth frame. A tenth of the objects is black, another tenth glass; both lack depth.
+    in every fourth frame. Some objects are black or of glass; both lack depth.
 
     Stacks: gaussians (the map), gaussians_look (with a look from the wrist), mesh (fused depth, marching cubes,
     python-fcl), cloud (points, an octree, python-fcl).

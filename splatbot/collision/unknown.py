@@ -225,7 +225,7 @@ def _observed(
             empty[seen[chosen]] = nearest > z[chosen] + radius
             hidden = (farthest > 0) & (farthest < z[chosen] - radius)
             looked[seen[chosen]] = ~hidden & ~masked[row, column]
-            lacks_depth[seen[chosen]] = (share >= CONSTANTS.suspect_share) & ~hidden
+            lacks_depth[seen[chosen]] = looked[seen[chosen]] & (share >= CONSTANTS.suspect_share)
     return empty, looked, lacks_depth
 
 

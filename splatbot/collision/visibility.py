@@ -31,7 +31,7 @@ class VisibilityConstants:
 CONSTANTS = VisibilityConstants()
 
 
-DepthView = tuple[NDArray[np.float32], Camera, Array]  # depth (H, W) [m], 0 if invalid, camera, T_world_camera (4, 4)
+DepthView = tuple[NDArray[np.float32], Camera, Array]  # depth (H, W) [m], 0 or NaN if invalid, camera, T_world_camera
 
 
 @dataclass(frozen=True, eq=False)

@@ -148,9 +148,12 @@ class MapPickPlanner:
         self._static = _Obstacles(whole, field(around), field(around_held))
         self._avoiding_moving: _Obstacles | None = None
         if sampler.moving is not None:
-            models = (sampler.scene.model, around, around_held)
-            whole, without, held = (field(model, avoid_moving=True) for model in models)
-            self._avoiding_moving = _Obstacles(sampler.departure_avoiding or whole, without, held)
+            if sampler.departure_avoiding is not None:
+                whole = sampler.departure_avoiding
+            else:
+                whole = field(sampler.scene.model, avoid_moving=True)
+            without, held = (field(model, avoid_moving=True) for model in (around, around_held))
+            self._avoiding_moving = _Obstacles(whole, without, held)
 
     def plan_to(self, grasp: Grasp, start: Array, *, avoid_moving: bool = False) -> PickPlan | str:
         """Plan a pick; see :class:`PickPlanner`."""

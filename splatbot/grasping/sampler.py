@@ -98,7 +98,7 @@ class GraspSampler:
             field: collision field of plans, with all their obstacles.
             unknown: field of unknown space alone, which the links before the hand avoid on the approach. If None, it
                 counts as free.
-            avoiding: ``field`` with the regions where motion was observed. If None, no such regions are known.
+            avoiding: ``field`` with the regions where motion was observed, which pick plans require with ``moving``.
         """
         self.departure, self.unknown, self.departure_avoiding = field, unknown, avoiding
 

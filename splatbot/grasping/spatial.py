@@ -180,7 +180,7 @@ def _at_mask(scene: SegmentedMap, view: ObservedView, mask: NDArray[np.bool_], *
     if not len(votes) or share.sum() < CONSTANTS.min_mask_majority / 2:
         rows = _marked_part(scene, seeds, _visible(scene, view, ~mask)) if exact else scene.grown(seeds)
         if not len(rows):
-            raise AffordanceError("shows only supports, no object.", field="mask", hint="mark an object")
+            raise AffordanceError("shows supports, or too little of an object.", field="mask", hint="mark an object")
         return Target(rows, None, "marked part", "place", 0.5, (_UNSEGMENTED,))
     k = int(np.argmax(votes))
     if votes[k] < CONSTANTS.min_mask_majority * votes.sum():

@@ -85,7 +85,7 @@ def raw_views(
         LogError: the log is damaged.
     """
     poses = run.load_poses()
-    indices, rectified = _spread(sorted(poses), most), _rectified(run, log)
+    indices, rectified = _spread(sorted(poses), most), rectified_log(run, log)
     views = []
     for index in indices:
         frame = rectified[index]
@@ -116,12 +116,12 @@ def _spread(indices: Sequence[int], most: int = CONSTANTS.max_frames_in_memory) 
 
 
 def _views(run: RunFolder, log: Log, poses: Mapping[int, Array], indices: Sequence[int]) -> Iterator[DepthView]:
-    config, rectified = run.load_config().tracking, _rectified(run, log)
+    config, rectified = run.load_config().tracking, rectified_log(run, log)
     for index in indices:
         frame = rectified[index]
         yield usable_depth(frame, config), frame.camera, poses[index]
 
 
-def _rectified(run: RunFolder, log: Log) -> RectifiedLog:
+def rectified_log(run: RunFolder, log: Log) -> RectifiedLog:
     """Return the frames as the run mapped them: moved to their stamps by its trajectory."""
     return RectifiedLog(log, run.load_config().sensor, run.load_trajectory())

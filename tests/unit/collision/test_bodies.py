@@ -116,6 +116,9 @@ def test_space_is_suspect_where_a_third_of_the_views_lack_depth_and_not_under_a_
     assert suspect(hole, hole)
     assert not suspect(hole)  # one view is chance
     assert not suspect(masked, masked, masked)  # the robot covers the view: it did not look
+    edge = masked.copy()
+    edge[20:80, 60:80] = 0.0  # a shadow next to the robot
+    assert not suspect(edge, edge)
     assert not suspect(hole, hole, wall)  # another view saw through it
     assert suspect(hole, hole, *[near] * 4)
     assert not suspect(hole, hole, *[near] * 5)  # too few of the views

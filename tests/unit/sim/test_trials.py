@@ -28,7 +28,7 @@ from splatbot.sim.trials.stacks import GaussianStack
 from splatbot.sim.trials.surfaces import surfaces_of
 from splatbot.sim.trials.table import physics, summaries, table_rows
 from splatbot.sim.trials.trial import CONSTANTS as TRIAL
-from splatbot.sim.trials.trial import TrialRow, TwinPickResult, _failure, _Watched, run_trial
+from splatbot.sim.trials.trial import VERSION, TrialRow, TwinPickResult, _failure, _Watched, run_trial
 from splatbot.sim.twin import Twin
 from splatbot.sim.wrist import T_PANDA_CAMERA
 
@@ -40,8 +40,9 @@ SLIPPED = TwinPickResult(False, "slip", "lost", "nothing is between the fingers 
 
 def row(seed: int, stack: str, ideal: TwinPickResult = HELD, held_out: TwinPickResult = HELD) -> TrialRow:
     return TrialRow(
-        seed, "tabletop", stack, "can", False, ideal, held_out, 10.0 + seed, 300.0, 4.0, 5_000_000, 50.0, 32, 320
-    )
+        seed, "tabletop", stack, "can", False, ideal, held_out, 10.0 + seed, 300.0, 4.0, 5_000_000, 50.0, 32, 320,
+        version=VERSION,
+    )  # fmt: skip
 
 
 def test_a_seed_gives_one_scene_at_rest_whose_objects_do_not_overlap() -> None:
@@ -144,7 +145,9 @@ def test_the_physics_that_a_table_holds_for_is_that_of_the_twin() -> None:
     assert 5.0 < found["shake_m_s2"] < 20.0
 
 
-def test_what_is_written_is_not_done_again_and_a_line_cut_short_is(tmp_path: Path) -> None:
+def test_what_is_written_is_not_done_again_and_a_line_cut_short_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = tmp_path / FILE
     kept = [row(0, "gaussians"), row(1, "gaussians", HELD, SLIPPED)]
     lines = [json.dumps(one.to_dict()) for one in kept]
@@ -153,6 +156,17 @@ def test_what_is_written_is_not_done_again_and_a_line_cut_short_is(tmp_path: Pat
     assert path.read_text() == "".join(f"{line}\n" for line in lines)
     rows, interrupted = run_trials(TrialsPlan(trials=2), tmp_path)
     assert (rows, interrupted) == (kept, False)
+    old = [json.dumps({**json.loads(line), "version": VERSION - 1}) for line in lines]
+    path.write_text("\n".join(old) + "\n")
+    asked: list[int] = []
+
+    def told(trial: TrialScene, *_: object, **__: object) -> list[TrialRow]:
+        asked.append(trial.seed)
+        return [row(trial.seed, "gaussians")]
+
+    monkeypatch.setattr("splatbot.sim.trials.run.run_trial", told)
+    run_trials(TrialsPlan(trials=2), tmp_path)
+    assert asked == [0, 1]  # rows of other physics are no results of these trials
     path.write_text("\n".join([lines[0][:40], lines[1]]) + "\n")
     with pytest.raises(FormatError, match="line 1"):
         read_rows(path)
