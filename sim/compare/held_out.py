@@ -30,7 +30,8 @@ class Spread:
         backlash: [rad].
         base: standard deviation of the normally distributed base position error, per axis [m].
         yaw: standard deviation of the normally distributed base yaw error [rad].
-        engine: whether MuJoCo's settings of contacts differ too, see :class:`ContactEngine`.
+        impratio: of the contacts, drawn log-uniformly. If None, the settings of contacts are those of the effects.
+        softness: time constant of the objects' contacts [s]; MuJoCo's default is 0.02.
     """
 
     friction: Range = (0.35, 1.2)
@@ -42,12 +43,13 @@ class Spread:
     backlash: Range = (0.0, 0.001)
     base: float = 0.001
     yaw: float = 0.001
-    engine: bool = False
+    impratio: Range | None = None
+    softness: Range = (0.004, 0.02)
 
 
 @dataclass(frozen=True)
 class ContactEngine:
-    """MuJoCo's settings of contacts in one held-out twin.
+    """MuJoCo's settings of contacts in one held-out twin; cone and solver are drawn with equal probability.
 
     Args:
         pyramidal: whether friction cones are pyramids.
@@ -60,10 +62,6 @@ class ContactEngine:
     solver: int
     impratio: float
     softness: float
-
-
-_IMPRATIO: Range = (3.0, 30.0)  # drawn log-uniformly
-_SOFTNESS: Range = (0.004, 0.02)  # [s]; MuJoCo's default is 0.02
 
 
 @dataclass(frozen=True)
@@ -100,11 +98,10 @@ def draw(spread: Spread, seed: int) -> HeldOutPhysics:
     x, y, z = (spread.base * rng.standard_normal(3)).tolist()
     yaw = spread.yaw * float(rng.standard_normal())
     engine = None
-    if spread.engine:
-        impratio = float(np.exp(rng.uniform(*np.log(_IMPRATIO))))
-        engine = ContactEngine(
-            bool(rng.random() < 0.5), int(rng.integers(1, 3)), impratio, float(rng.uniform(*_SOFTNESS))
-        )
+    if spread.impratio is not None:
+        impratio = float(np.exp(rng.uniform(*np.log(spread.impratio))))
+        pyramidal, solver = bool(rng.random() < 0.5), int(rng.integers(1, 3))
+        engine = ContactEngine(pyramidal, solver, impratio, float(rng.uniform(*spread.softness)))
     return HeldOutPhysics(**values, base=(x, y, z), yaw=yaw, engine=engine)
 
 

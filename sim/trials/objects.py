@@ -29,10 +29,9 @@ class TrialObject:
     Args:
         kind: of object.
         shapes: in its own frame.
-        height: of its origin over its support [m].
+        height: of its origin over its support [m], half of its own height.
         radius: horizontal extent from its origin [m].
         fits: whether the hand fits around it.
-        top: height over its support [m].
     """
 
     kind: str
@@ -40,52 +39,51 @@ class TrialObject:
     height: float
     radius: float
     fits: bool = True
-    top: float = 0.15
 
 
 def box(rng: np.random.Generator) -> TrialObject:
     """Create a box."""
     narrow, wide, high = (float(rng.uniform(*r)) for r in ((0.03, 0.062), (0.045, 0.11), (0.04, 0.12)))
     shape = {"kind": "box", "size": (wide, narrow, high)}
-    return TrialObject("box", (shape,), high / 2, float(np.hypot(wide, narrow)) / 2, top=high)
+    return TrialObject("box", (shape,), high / 2, float(np.hypot(wide, narrow)) / 2)
 
 
 def can(rng: np.random.Generator) -> TrialObject:
     """Create an upright cylinder."""
     r, h = float(rng.uniform(0.018, 0.033)), float(rng.uniform(0.06, 0.14))
-    return TrialObject("can", ({"kind": "cylinder", "radius": r, "height": h},), h / 2, r, top=h)
+    return TrialObject("can", ({"kind": "cylinder", "radius": r, "height": h},), h / 2, r)
 
 
 def lying(rng: np.random.Generator) -> TrialObject:
     """Create a lying cylinder."""
     r, h = float(rng.uniform(0.02, 0.032)), float(rng.uniform(0.09, 0.14))
     shape = {"kind": "cylinder", "radius": r, "height": h, "rpy": [np.pi / 2, 0.0, 0.0]}
-    return TrialObject("lying can", (shape,), r, float(np.hypot(r, h / 2)), top=2 * r)
+    return TrialObject("lying can", (shape,), r, float(np.hypot(r, h / 2)))
 
 
 def ball(rng: np.random.Generator) -> TrialObject:
     """Create a sphere."""
     r = float(rng.uniform(0.022, 0.034))
-    return TrialObject("ball", ({"kind": "sphere", "radius": r},), r, r, top=2 * r)
+    return TrialObject("ball", ({"kind": "sphere", "radius": r},), r, r)
 
 
 def egg(rng: np.random.Generator) -> TrialObject:
     """Create an ellipsoid."""
     a, b, c = float(rng.uniform(0.03, 0.045)), float(rng.uniform(0.022, 0.032)), float(rng.uniform(0.022, 0.032))
-    return TrialObject("egg", ({"kind": "ellipsoid", "axes": [a, b, c]},), c, a, top=2 * c)
+    return TrialObject("egg", ({"kind": "ellipsoid", "axes": [a, b, c]},), c, a)
 
 
 def book(rng: np.random.Generator) -> TrialObject:
     """Create a lying book, under which no finger fits."""
     size = (float(rng.uniform(0.15, 0.20)), float(rng.uniform(0.11, 0.14)), float(rng.uniform(0.02, 0.035)))
     around = float(np.hypot(*size[:2])) / 2
-    return TrialObject("book", ({"kind": "box", "size": size},), size[2] / 2, around, False, size[2])
+    return TrialObject("book", ({"kind": "box", "size": size},), size[2] / 2, around, False)
 
 
 def cup(rng: np.random.Generator) -> TrialObject:
     """Create a cup, hollow and open at the top: staves around a bottom."""
     r, h = float(rng.uniform(0.028, 0.035)), float(rng.uniform(0.07, 0.11))
-    return TrialObject("cup", tuple(_hollow(r, h)), h / 2, r, top=h)
+    return TrialObject("cup", tuple(_hollow(r, h)), h / 2, r)
 
 
 def mallet(rng: np.random.Generator) -> TrialObject:
@@ -96,7 +94,7 @@ def mallet(rng: np.random.Generator) -> TrialObject:
         {"kind": "box", "size": [0.035, 0.07, head], "at": [length / 2, 0.0, 0.0]},
         {"kind": "box", "size": [0.02, head, head], "at": [-length / 2, 0.0, 0.0]},
     )
-    return TrialObject("mallet", shapes, head / 2, length / 2 + 0.03, top=head)
+    return TrialObject("mallet", shapes, head / 2, length / 2 + 0.03)
 
 
 CONVEX: tuple[Maker, ...] = (box, can, ball, lying, box, egg)
@@ -111,8 +109,7 @@ def household(kind: str, rng: np.random.Generator) -> TrialObject:
     for shape in shapes:
         shape["at"] = [float(x) for x in np.asarray(shape.get("at", (0.0, 0.0, 0.0))) - middle]
     radius = float(np.linalg.norm((vertices - middle)[:, :2], axis=1).max())
-    tall = float(high[2] - low[2])
-    return TrialObject(kind, tuple(shapes), tall / 2, radius, top=tall)
+    return TrialObject(kind, tuple(shapes), float(high[2] - low[2]) / 2, radius)
 
 
 def _bottle(rng: np.random.Generator) -> Shapes:
@@ -167,14 +164,8 @@ def _spray_bottle(rng: np.random.Generator) -> Shapes:
 
 def _shoe(rng: np.random.Generator) -> Shapes:
     sole = [(x, y, z) for x, y in ((-0.075, 0.024), (-0.02, 0.022), (0.04, 0.032), (0.08, 0.018)) for z in (0.0, 0.018)]
-    heel = [
-        (x, y, z)
-        for x, y, z in ((-0.075, 0.022, 0.018), (-0.01, 0.02, 0.018), (-0.07, 0.02, 0.065), (-0.025, 0.018, 0.065))
-    ]
-    toe = [
-        (x, y, z)
-        for x, y, z in ((-0.02, 0.022, 0.018), (0.075, 0.018, 0.018), (-0.025, 0.018, 0.055), (0.05, 0.018, 0.03))
-    ]
+    heel = [(-0.075, 0.022, 0.018), (-0.01, 0.02, 0.018), (-0.07, 0.02, 0.065), (-0.025, 0.018, 0.065)]
+    toe = [(-0.02, 0.022, 0.018), (0.075, 0.018, 0.018), (-0.025, 0.018, 0.055), (0.05, 0.018, 0.03)]
     return [_hull(_mirrored(part)) for part in (sole, heel, toe)]
 
 
@@ -249,7 +240,7 @@ def _bear(rng: np.random.Generator) -> Shapes:
 
 def _camera(rng: np.random.Generator) -> Shapes:
     lens = {"kind": "cylinder", "radius": 0.026, "height": 0.05, "at": [0.0, 0.04, 0.036], "rpy": [np.pi / 2, 0.0, 0.0]}
-    finder = _hull([(x, y, z) for x in (-0.02, 0.02) for y in (-0.015, 0.015) for z in (0.07,)] + [(0.0, 0.0, 0.088)])
+    finder = _hull([(x, y, 0.07) for x in (-0.02, 0.02) for y in (-0.015, 0.015)] + [(0.0, 0.0, 0.088)])
     return [{"kind": "box", "size": [0.11, 0.038, 0.072], "at": [0.0, 0.0, 0.036]}, lens, finder]
 
 

@@ -45,7 +45,7 @@ class TrialScanConstants:
     Args:
         max_depth: [m] depth that is used.
         rate: [Hz] frames per second.
-        click_stride: every n-th frame is a candidate for the click.
+        mark_stride: every n-th frame may carry a click or a mask.
         pose_sigma: [m], [rad] standard deviation of the camera pose by the arm's joints.
         calibration_sigma: [m], [rad] standard deviation of the hand-eye transform of a trial.
         holes: share of the pixels of a black object, and of those of glass, without depth.
@@ -54,7 +54,7 @@ class TrialScanConstants:
 
     max_depth: float = 0.95
     rate: float = 4.0
-    click_stride: int = 4
+    mark_stride: int = 4
     pose_sigma: tuple[float, float] = (5e-4, 5e-4)
     calibration_sigma: tuple[float, float] = (1e-3, 2e-3)
     holes: tuple[float, float] = (0.5, 0.8)
@@ -69,12 +69,10 @@ MAPPING = {"stride": 1, "surface_depth_tolerance": 0.01, "means_lr": 0.0, "refin
 _TABLE = RaycastSurface(
     box([1.0, 1.4, 0.04]).placed([0.6, 0.0, -0.04]), Texture((0.60, 0.50, 0.40), (0.42, 0.33, 0.25), 0.05)
 )
-
-
-_WALLS = Texture((0.72, 0.72, 0.70), (0.60, 0.60, 0.62), 0.25)
+# A room around the table, 0.75 m above its floor; without it, rays past the table measure nothing.
 _ROOM = RaycastSurface(
-    box([4.0, 4.0, 2.6]).placed([0.5, 0.0, -0.75]), _WALLS
-)  # seen from inside; the table is 0.75 m high
+    box([4.0, 4.0, 2.6]).placed([0.5, 0.0, -0.75]), Texture((0.72, 0.72, 0.70), (0.60, 0.60, 0.62), 0.25)
+)
 
 
 class UnseenError(InputError):
@@ -280,7 +278,7 @@ def _hints(trial: TrialScene, log: WristLog, frames: Sequence[Frame], poses: Arr
     """
     twin = Twin(trial.scene)
     shown: dict[str, list[tuple[int, NDArray[np.bool_]]]] = {}
-    for k in range(0, len(frames), CONSTANTS.click_stride):
+    for k in range(0, len(frames), CONSTANTS.mark_stride):
         if not np.isfinite(poses[k]).all():
             continue
         twin.reset(log.joints[k])

@@ -258,7 +258,7 @@ def _dropped(items: list[TrialObject], rng: np.random.Generator) -> Placed:
     colors = rng.permutation(len(_COLORS))
     z = 0.02
     for k, item in enumerate(items):
-        reach = float(np.hypot(item.radius, item.top / 2))
+        reach = float(np.hypot(item.radius, item.height))
         free = np.maximum(np.array(_BIN_SIZE[:2]) / 2 - reach, 0.0)
         at = np.array(_BIN_CENTER) + rng.uniform(-free, free)
         turn = [float(x) for x in rng.uniform(-np.pi, np.pi, 3)]

@@ -51,9 +51,8 @@ class StackConstants:
 CONSTANTS = StackConstants()
 
 
-_WORKSPACE = np.array(
-    [[-2.0, -2.0, -0.2], [2.0, 2.0, 0.35]]
-)  # [m] of segmentation, from the base; below the shelf's board
+# [m] corners of segmentation from the base, below the board of a shelf.
+_WORKSPACE = np.array([[-2.0, -2.0, -0.2], [2.0, 2.0, 0.35]])
 SENSOR = SensorConfig()  # noise of depth that confirms a point
 OPTIONS = PickOptions(lift=CONSTANTS.lift, budget_ms=CONSTANTS.budget_ms, tries=8, grasp=GraspOptions())
 
@@ -108,11 +107,8 @@ class GaussianStack:
         """Implement :meth:`Stack.learn`."""
         begin = time.perf_counter()
         sampler = self.sampler(scan)
-        _agree_with_plans(sampler)
-        return self.known(scan, sampler, begin)
-
-    def known(self, scan: TrialScan, sampler: GraspSampler, begin: float) -> StackMap:
-        """Return the stack's representation with a sampler, built since ``begin`` [s]."""
+        if not self.looks:  # the obstacles of plans do not follow a target that moved
+            _agree_with_plans(sampler)
         seconds = scan.seconds + time.perf_counter() - begin
         world = sampler.scene.model.nbytes + sampler.field.nbytes
         return StackMap(
@@ -147,26 +143,22 @@ def _agree_with_plans(sampler: GraspSampler) -> None:
         normal = T[:3, :3] @ support.normal
         plane = np.append(normal, -support.offset - normal @ T[:3, 3])
 
-    def around(model: GaussianModel) -> GaussianCollisionField:
+    def with_plane(model: GaussianModel) -> GaussianCollisionField:
         obstacles = PlanObstacles(GaussianCollisionField(model), model, arm, panda().home, plane=plane)
         return obstacles.field(CONSTANTS.margin)
 
     model, avoiding = sampler.scene.model, None
+    field = with_plane(model)
     if sampler.moving is not None:
-        avoiding = around(with_balls(model, sampler.moving, n_sigma=2.0, observations=CONSTANTS.min_observations))
-    sampler.agree_with_plans(around(model), avoiding=avoiding)
+        avoiding = with_plane(with_balls(model, sampler.moving, n_sigma=field.n_sigma, observations=1))
+    sampler.agree_with_plans(field, avoiding=avoiding)
 
 
 class LookingStack(GaussianStack):
-    """The same, with a look from the wrist before the fingers close, and further attempts."""
+    """The same without the obstacles of plans, with a look from the wrist before the fingers close, and retries."""
 
     name = "gaussians_look"
     looks = True
-
-    def learn(self, scan: TrialScan) -> StackMap:
-        """Implement :meth:`Stack.learn` without the obstacles of plans, which do not follow a target that moved."""
-        begin = time.perf_counter()
-        return self.known(scan, self.sampler(scan), begin)
 
 
 @dataclass(frozen=True, eq=False)

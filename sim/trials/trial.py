@@ -55,7 +55,7 @@ CONSTANTS = TrialConstants()
 VERSION = 2
 """Version of scenes and physics of trials. A change that gives a seed another scene or twin increases it."""
 
-HELD_OUT = Spread(engine=True)
+HELD_OUT = Spread(impratio=(3.0, 30.0))
 """Physics of the held-out twin. The ranges were chosen before any trial ran with them."""
 
 

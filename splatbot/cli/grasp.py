@@ -250,14 +250,15 @@ def _views(map_: Path, indices: tuple[int, ...]) -> list[ObservedView]:
     poses = run.load_poses()
     log = reopen_log(run)
     camera, views = replace(log.camera, distortion=()), []
+    mapped = rectified_log(run, log) if len(indices) > 1 else None  # its depth is compared with several masks
     for index in indices:
         if index not in poses:
             hint = f"one of {min(poses)}..{max(poses)} that has"
             raise InputError(f"is {index}, which has no pose.", field="--index", hint=hint)
         depth = None
-        if len(indices) > 1:  # several masks are compared with the depth that the run mapped
-            mapped = rectified_log(run, log)[index]
-            depth = np.where(mapped.valid, mapped.depth, np.float32(0))
+        if mapped is not None:
+            frame = mapped[index]
+            depth = np.where(frame.valid, frame.depth, np.float32(0))
         views.append(ObservedView(camera, poses[index], log[index].rgb, depth))
     return views
 

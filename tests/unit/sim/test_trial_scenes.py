@@ -70,7 +70,7 @@ def test_the_camera_and_physics_see_the_same_household_shape(kind: str) -> None:
 @pytest.mark.parametrize("kind", HOUSEHOLD)
 def test_a_household_shape_comes_to_rest_on_the_table(kind: str) -> None:
     item = household(kind, np.random.default_rng(3))
-    assert 0.02 < item.top < 0.19
+    assert 0.01 < item.height < 0.095
     objects = [{"name": TABLE, "shapes": [{"kind": "plane"}]}, _placed(kind, at=(0.5, 0.0, item.height), movable=True)]
     twin = Twin(make_scene({"name": "one", "robot": None, "objects": objects}))
     none = np.zeros(0)
