@@ -320,7 +320,7 @@ def _print(result: GraspResult, folder: Path, margin: str, *, verbose: bool) -> 
         values = (f"{g.terms[name]:.2f}" for name in terms)
         table.add_row(str(k), f"{g.total:.3f}", f"{g.confidence:.2f}", g.approach, *lengths, *contact, *values)
     print_columns(table)
-    print_text("from: the hand comes from above (top, within 40 degrees), from the robot's side (front), or otherwise")
+    print_text("from: above (top, within 40 degrees), level away from the robot (front), level (side), else (free)")
     print_text("width of the closed hand, opening on the approach, and clearance from the surroundings, in mm")
     print_text("the best total is 1; --verbose prints its terms, of which the best value is 1")
     print_text("conf.: share of such grasps that succeeded in simulation; errors of the map are not in it")
