@@ -97,9 +97,9 @@ HEAD = (
     "% held-out twin (95 %)",
     "% ideal twin",
     "drop",
-    "plan [ms]",
-    "grasps [ms]",
-    "world [MB]",
+    "plan, ms",
+    "grasps, ms",
+    "world, MB",
     "failures",
 )
 

@@ -196,8 +196,8 @@ def pick_with(
     mistaken = _mistaken(known, decision.target, trial)
     for twin in (Twin(trial.scene), held_out_twin(trial)):
         results.append(attempt(decision, trial, twin, mistaken=mistaken, moved=moved))
-    (ideal, first), (held_out, _) = results
-    if videos is not None and not held_out.success:
+    (ideal, first), (held_out, last) = results
+    if videos is not None and not held_out.success and last.motions:  # an arm that did not move shows nothing
         _film(decision, trial, videos / f"{trial.family}-{trial.seed}-{stack.name}.mp4", moved)
     return _row(stack, trial, scan, known, decision, first, ideal, held_out)
 

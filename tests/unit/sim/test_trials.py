@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.text import Text
 
 from splatbot.errors import FormatError, InputError
 from splatbot.grasping.pick_types import PickOutcome, PickResult, PickStage
@@ -26,7 +27,7 @@ from splatbot.sim.trials.shake import CONSTANTS as SHAKE
 from splatbot.sim.trials.shake import Shake
 from splatbot.sim.trials.stacks import GaussianStack
 from splatbot.sim.trials.surfaces import surfaces_of
-from splatbot.sim.trials.table import physics, summaries, table_rows
+from splatbot.sim.trials.table import HEAD, physics, summaries, table_rows
 from splatbot.sim.trials.trial import CONSTANTS as TRIAL
 from splatbot.sim.trials.trial import VERSION, TrialRow, TwinPickResult, _failure, _Watched, run_trial
 from splatbot.sim.twin import Twin
@@ -133,6 +134,7 @@ def test_the_table_counts_what_the_rows_say() -> None:
     assert ours["by_kind"] == {"can": "2 of 3"}
     assert (theirs["success"], theirs["drop"]) == (0.0, 0.0)
     assert [words[0] for words in table_rows([ours, theirs])] == ["ours", "theirs"]
+    assert all(Text.from_markup(name).plain == name for name in HEAD)  # rich swallows units in brackets
 
 
 def test_the_physics_that_a_table_holds_for_is_that_of_the_twin() -> None:
