@@ -136,7 +136,10 @@ class MapLibrary:
             shutil.rmtree(draft, ignore_errors=True)
         self.failing.pop(served.id, None)
         self._kept[served.id] = served.generation, served.map_version
-        _sweep(home, keep=[path.name for path in _states(home)[:2]])
+        try:
+            _sweep(home, keep=[path.name for path in _states(home)[:2]])
+        except OSError as error:  # the state is saved; a disk that vanished is the next save's failure
+            _log.warning("map %s: older states cannot be removed: %s", served.id, error)
 
     def remove(self, map_id: str) -> None:
         """Forget a map; one that was never saved is no error.

@@ -254,6 +254,8 @@ class Runtime:
                 self.save(served)
             except SplatbotError as error:
                 _log.error("%s", error)
+            except Exception:  # a defect: the other maps are saved all the same, and this one is tried again
+                _log.exception("map %s cannot be saved", served.id)
 
 
 def check_exposure(settings: ServiceSettings) -> None:

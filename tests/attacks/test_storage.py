@@ -23,7 +23,7 @@ from splatbot.formats.ply import load_ply
 from splatbot.services.library import MapLibrary
 from splatbot.services.scratch import Scratch, sweep_scratch
 from splatbot.services.settings import ServiceSettings
-from splatbot.services.store import MapStore
+from splatbot.services.store import MapStore, ServedMap
 from splatbot.trajectory import Trajectory
 from splatbot.workspace import Workspace
 from tests.contracts.conftest import Service, running, wall
@@ -212,6 +212,40 @@ def test_a_disk_that_vanishes_is_told_and_nothing_is_written_beneath_it(small_di
         until(lambda: service.client.get("/readyz").json().get("unsaved") == 1)
         assert list(small_disk.iterdir()) == []
         assert service.client.get("/v1/maps/desk").json()["map_version"] == 2
+
+
+def test_a_disk_that_vanishes_within_a_save_does_not_end_the_saving(
+    small_disk: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def vanish(folder: Path) -> None:  # after the last step of the first save, before older states are removed
+        monkeypatch.undo()
+        subprocess.run(["umount", "-l", folder], check=True)
+
+    monkeypatch.setattr("splatbot.services.library.sync_folder", vanish)
+    with running(ServiceSettings(data_dir=small_disk, save_every_s=0.1)) as service:
+        service.store.add("desk", source="log", state="mapping", snapshot=wall(1))
+        until(lambda: not os.path.ismount(small_disk))
+        service.store.publish("desk", wall(2))
+        until(lambda: service.client.get("/readyz").json().get("unsaved") == 1)
+
+
+def test_a_defect_in_saving_one_map_does_not_end_the_saving_of_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save = MapLibrary.save
+
+    def fail(library: MapLibrary, served: ServedMap) -> None:
+        if served.id == "broken":
+            raise RuntimeError("a defect")
+        save(library, served)
+
+    monkeypatch.setattr(MapLibrary, "save", fail)
+    with running(ServiceSettings(data_dir=tmp_path, save_every_s=0.1)) as service:
+        service.store.add("broken", source="log", state="mapping", snapshot=wall(1))
+        service.store.add("desk", source="log", state="mapping", snapshot=wall(1))
+        until(lambda: (tmp_path / "desk" / "v1").is_dir())
+        service.store.publish("desk", wall(2))
+        until(lambda: (tmp_path / "desk" / "v2").is_dir())
 
 
 def test_an_idempotency_key_covers_the_uploaded_file() -> None:
