@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -10,6 +10,9 @@ from torch import Tensor
 from splatbot.errors import InputError
 from splatbot.gaussians import GaussianModel
 from splatbot.rasterize.native import native
+
+Rate = float | Sequence[float]
+"""A learning rate: one, or one for each value of a row."""
 
 PARAMETERS = ("means", "quats", "log_scales", "opacity_logits", "sh")
 
@@ -23,7 +26,7 @@ class GaussianAdam:
     betas = (0.9, 0.99)
     eps = 1e-15
 
-    def __init__(self, rates: Mapping[str, float]) -> None:
+    def __init__(self, rates: Mapping[str, Rate]) -> None:
         self.rates = dict(rates)
         self.steps = torch.zeros(0)
         self.skipped = 0
@@ -47,6 +50,14 @@ class GaussianAdam:
         for moments in (self.first, self.second):
             for name in PARAMETERS:
                 moments[name] = moments[name][index]
+
+    def forget(self, rows: Tensor, names: Sequence[str] = PARAMETERS) -> None:
+        """Set the moments of these rows to zero; with all parameters, their counts of steps too."""
+        for moments in (self.first, self.second):
+            for name in names:
+                moments[name][rows] = 0.0
+        if set(names) == set(PARAMETERS):
+            self.steps[rows] = 0.0
 
     def state(self) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
         """Return the moments and counts, shared: a step changes them, :meth:`extend` and :meth:`select` copy."""
@@ -87,7 +98,7 @@ def adam_step(
     second: Mapping[str, Tensor],
     steps: Tensor,
     visible: Tensor,
-    rates: Mapping[str, float],
+    rates: Mapping[str, Rate],
     *,
     betas: tuple[float, float],
     eps: float,
@@ -99,7 +110,7 @@ def adam_step(
         grads: of each parameter; ``first`` and ``second``: its moments, all of its shape.
         steps: (N,) float32, the number of steps each row has taken; counted up for the visible ones.
         visible: (N,) bool.
-        rates: learning rate of each parameter.
+        rates: learning rate of each parameter; one, or one for each value of a row.
         betas: decay of the two moments.
         eps: added to the root of the second moment, > 0.
 
@@ -128,13 +139,22 @@ def adam_step(
         [grads[name].detach().contiguous() for name in names],
         [first[name] for name in names],
         [second[name] for name in names],
-        [rates[name] for name in names],
+        [_row_rates(name, rates[name], parameters[name]) for name in names],
         visible.contiguous().view(torch.uint8),
         steps,
         *betas,
         eps,
     )
     return skipped
+
+
+def _row_rates(name: str, rate: Rate, parameter: Tensor) -> list[float]:
+    if isinstance(rate, (int, float)):
+        return [float(rate)]
+    columns = parameter[0].numel() if len(parameter) else len(rate)
+    if len(rate) != columns:
+        raise InputError(f"has {len(rate)} rates.", field=name, hint=f"give one, or {columns}: one for each value")
+    return [float(r) for r in rate]
 
 
 def _check(name: str, tensor: Tensor, rows: int) -> None:

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from splatbot.atomic import replace_files, write_text
+from splatbot.atomic import atomic_write, replace_files, write_text
 from splatbot.checksums import NAME as SUMS
 from splatbot.checksums import check_file, read_sums, write_sums
 from splatbot.config import Config, load_config
@@ -80,6 +80,7 @@ class RunFolder:
         self.frames = self.path / "frames.jsonl"
         self.metrics = self.path / "metrics.json"
         self.map = self.path / "map.ply"
+        self.mapped = self.path / "map.mapped.ply"
         self.report = self.path / "report.html"
         self.map_page = self.path / "map.html"
         self.audit = self.path / "audit.json"
@@ -130,6 +131,21 @@ class RunFolder:
                 self.metrics.name: write_text(_metrics_text(metrics)),
             },
             # a run that is killed from here on has no checksums
+            remove=(self.report.name, self.map_page.name, self.audit.name, SUMS),
+        )
+        write_sums(self.path, self._files())
+
+    def replace_map(self, model: GaussianModel) -> None:
+        """Replace the map by one that was trained further; ``map.mapped.ply`` keeps the first one.
+
+        Report, map page and audit are deleted because they describe the earlier map.
+        """
+        if not self.mapped.exists():
+            with atomic_write(self.mapped) as kept:
+                kept.write(self._require(self.map).read_bytes())
+        replace_files(
+            self.path,
+            {self.map.name: lambda path: save_ply(model, path, bookkeeping=True)},
             remove=(self.report.name, self.map_page.name, self.audit.name, SUMS),
         )
         write_sums(self.path, self._files())

@@ -41,7 +41,7 @@ double l1_dssim(const Images& rendered, const Images& target, const std::optiona
 }
 
 std::size_t adam_step(const std::vector<Values>& values, const std::vector<ConstValues>& gradients,
-               const std::vector<Values>& first, const std::vector<Values>& second, const std::vector<double>& rates,
+               const std::vector<Values>& first, const std::vector<Values>& second, const std::vector<std::vector<float>>& rates,
                const Chosen& chosen, const Steps& steps, double beta1, double beta2, double eps) {
   const std::size_t n = values.size();
   if (gradients.size() != n || first.size() != n || second.size() != n || rates.size() != n) {
@@ -51,7 +51,7 @@ std::size_t adam_step(const std::vector<Values>& values, const std::vector<Const
   for (std::size_t i = 0; i < n; ++i) {
     parameters.push_back({std::span(values[i].data(), values[i].size()), std::span(first[i].data(), first[i].size()),
                           std::span(second[i].data(), second[i].size()),
-                          std::span(gradients[i].data(), gradients[i].size()), rates[i]});
+                          std::span(gradients[i].data(), gradients[i].size()), std::span(rates[i])});
   }
   const nb::gil_scoped_release release;
   return splatbot::adam_step(parameters, std::span(chosen.data(), chosen.size()), std::span(steps.data(), steps.size()),

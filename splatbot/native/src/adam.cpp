@@ -30,10 +30,14 @@ std::vector<AdamGroup> groups_of(std::span<const AdamParameter> parameters, std:
     require(rows == 0 ? size == 0 : size % rows == 0, "a parameter has another number of rows");
     require(p.first.size() == size && p.second.size() == size && p.gradient.size() == size,
             "a parameter, its gradient and its moments differ in size");
-    if (size > 0) {
-      groups.push_back({p.values.data(), p.first.data(), p.second.data(), p.gradient.data(), size / rows,
-                        static_cast<float>(p.rate)});
+    if (size == 0) {
+      continue;
     }
+    const std::size_t columns = size / rows;
+    const bool one = p.rates.size() == 1;
+    require(one || p.rates.size() == columns, "a parameter has neither one rate nor one for each column");
+    groups.push_back({p.values.data(), p.first.data(), p.second.data(), p.gradient.data(), columns,
+                      one ? p.rates[0] : 1.0F, one ? nullptr : p.rates.data()});
   }
   return groups;
 }

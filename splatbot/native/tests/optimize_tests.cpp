@@ -87,7 +87,8 @@ void run_adam(std::size_t rows, std::size_t columns) {
     spoilt += chosen[i];
     chosen[i] = chosen[i] != 0 ? 2 : 0;
   }
-  const AdamParameter parameter = {values, first, second, gradient, 0.5};
+  const std::vector<float> rates(rows % 2 == 0 ? 1 : columns, 0.5F);  // one, or one for each column
+  const AdamParameter parameter = {values, first, second, gradient, rates};
   promise(adam_step(std::span(&parameter, 1), chosen, steps, {.eps = 1e-12}) == spoilt, "spoilt gradients are counted");
   for (std::size_t i = 0; i < values.size(); ++i) {
     const bool on = chosen[i / columns] == 1;

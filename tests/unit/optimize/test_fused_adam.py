@@ -59,6 +59,45 @@ def test_all_rows_step_as_torch_does(n: int, eps: float) -> None:
     assert torch.equal(run.steps, torch.full((n,), 20.0))
 
 
+def test_a_rate_for_each_column_steps_as_separate_parameters_do() -> None:
+    n = 1500
+    whole, apart = Run(n), Run(n)
+    width = whole.values["d"][0].numel()
+    rates = [0.01 / (1 + c) for c in range(width)]
+    for _ in range(5):
+        gradient = whole.gradients()["d"]
+        visible = torch.rand(n, generator=whole.random) < 0.7
+        moments = ({"d": whole.first["d"]}, {"d": whole.second["d"]})
+        values = {"d": whole.values["d"]}
+        adam_step(values, {"d": gradient}, *moments, whole.steps, visible, {"d": rates}, betas=(0.9, 0.99), eps=1e-15)
+        flat = gradient.reshape(n, width)
+        for c in range(width):
+            columns = {
+                name: {"d": tensors["d"].reshape(n, width)[:, c].contiguous()}
+                for name, tensors in (("values", apart.values), ("first", apart.first), ("second", apart.second))
+            }
+            steps = apart.steps.clone()
+            column = {"d": flat[:, c].contiguous()}
+            adam_step(
+                columns["values"], column, columns["first"], columns["second"], steps, visible, {"d": rates[c]},
+                betas=(0.9, 0.99), eps=1e-15,
+            )  # fmt: skip
+            for name, tensors in (("values", apart.values), ("first", apart.first), ("second", apart.second)):
+                tensors["d"].reshape(n, width)[:, c] = columns[name]["d"]
+        apart.steps = steps
+        assert torch.equal(whole.first["d"], apart.first["d"])
+        torch.testing.assert_close(whole.values["d"], apart.values["d"], rtol=1e-6, atol=1e-7)
+
+
+def test_a_wrong_number_of_column_rates_is_refused() -> None:
+    run = Run(3)
+    with pytest.raises(InputError, match=r"has 2 rates.*give one, or 3"):
+        adam_step(
+            {"a": run.values["a"]}, run.gradients(), run.first, run.second, run.steps,
+            torch.ones(3, dtype=torch.bool), {"a": [0.1, 0.2]}, betas=(0.9, 0.99), eps=1e-15,
+        )  # fmt: skip
+
+
 def test_rows_out_of_view_keep_their_bits_and_their_own_count_of_steps() -> None:
     n = 3000
     run = Run(n)

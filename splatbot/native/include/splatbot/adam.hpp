@@ -7,11 +7,12 @@
 
 namespace splatbot {
 
-// One kind of parameter: (rows, columns) values, their gradient and moments, and its learning rate.
+// One kind of parameter: (rows, columns) values, their gradient and moments, and its learning rate: one, or one for each
+// column.
 struct AdamParameter {
   std::span<float> values, first, second;
   std::span<const float> gradient;
-  double rate = 0.0;
+  std::span<const float> rates;
 };
 
 struct AdamOptions {

@@ -186,6 +186,7 @@ struct AdamGroup {
   const float* gradient;
   std::size_t columns;
   float rate;
+  const float* column_rates;  // (columns,), multiplied with `rate`; or null
 };
 
 // Steps one block of rows. `step_scale` is sqrt(1 - b2^t) / (1 - b1^t) of each row, 0 for a row that is not stepped. `eps` is scaled by sqrt(1 - b2^t) as well.

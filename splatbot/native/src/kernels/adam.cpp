@@ -25,6 +25,15 @@ void spread(const float* values, std::size_t rows, std::size_t columns, float* o
   }
 }
 
+// Each row's value times each column's rate.
+void spread(const float* values, std::size_t rows, std::size_t columns, const float* rates, float* out) {
+  for (std::size_t r = 0; r < rows; ++r) {
+    for (std::size_t c = 0; c < columns; ++c) {
+      out[r * columns + c] = values[r] * rates[c];
+    }
+  }
+}
+
 struct Elements {
   float *values, *first, *second;
   const float *gradient, *step_scale, *eps;
@@ -52,7 +61,11 @@ void adam(const AdamGroup& group, const AdamBlock& block) {
   const std::size_t offset = block.begin * group.columns, n = block.count * group.columns;
   float* step_scale = block.scratch;
   float* eps = block.scratch + n + W;
-  spread(block.step_scale, block.count, group.columns, step_scale);
+  if (group.column_rates != nullptr) {
+    spread(block.step_scale, block.count, group.columns, group.column_rates, step_scale);
+  } else {
+    spread(block.step_scale, block.count, group.columns, step_scale);
+  }
   spread(block.eps, block.count, group.columns, eps);
   const Elements all{group.values + offset, group.first + offset, group.second + offset,
                      group.gradient + offset, step_scale, eps};

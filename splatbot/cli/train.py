@@ -1,0 +1,221 @@
+"""`splatbot train`."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from splatbot.cli.paths import check_output
+from splatbot.errors import InputError
+
+if TYPE_CHECKING:
+    from splatbot.gaussians import GaussianModel
+    from splatbot.training.datasets import TrainingData
+    from splatbot.training.folder import TrainingFolder, TrainingSettings
+    from splatbot.training.session import TrainingProgress
+
+_DEFAULT_ITERATIONS = 7_000
+
+
+def train(
+    dataset: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="DATASET")] = None,
+    /,
+    out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
+    minutes: Annotated[float | None, tyro.conf.arg(metavar="MIN")] = None,
+    iterations: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
+    strategy: Literal["auto", "default", "absgrad", "mcmc", "fixed"] = "auto",
+    max_gaussians: Annotated[int, tyro.conf.arg(metavar="N")] = 200_000,
+    sh_degree: Annotated[int, tyro.conf.arg(metavar="D")] = 3,
+    scale: Annotated[int, tyro.conf.arg(metavar="S")] = 1,
+    background: Literal["auto", "black", "white", "random"] = "auto",
+    refine_poses: bool = False,
+    antialiased: bool = False,
+    held_out_every: Annotated[int, tyro.conf.arg(metavar="K")] = 8,
+    seed: int = 0,
+    checkpoint_every: Annotated[float, tyro.conf.arg(metavar="S")] = 60.0,
+    resume: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
+    overwrite: bool = False,
+    quiet: bool = False,
+) -> int:
+    """Train a map of Gaussians from posed photographs, or improve the map of a run.
+
+    DATASET is a COLMAP scene (sparse/0 and images), a Blender scene (transforms_train.json), a Nerfstudio or
+    instant-ngp scene (transforms.json), or a folder that `splatbot map` wrote. The map of a run is replaced by the
+    trained one; RUN/map.mapped.ply keeps the earlier one.
+
+    Writes map.ply, trajectory.tum, scores.json, progress.jsonl, course.png and held_out.jpg. Held-out views are not
+    trained on: every eighth, or those that the dataset marks. Ctrl-C scores and saves what was trained; a run that was
+    killed loses at most the time since the last checkpoint. --resume continues both.
+
+    Examples:
+        splatbot train scenes/garden --minutes 10 --scale 4
+        splatbot train scenes/lego --iterations 20000 --out runs/lego
+        splatbot train scenes/fox --strategy mcmc --max-gaussians 100000
+        splatbot train scenes/phone --refine-poses
+        splatbot train runs/desk --minutes 5
+        splatbot train --resume runs/lego
+        splatbot render runs/lego --video lego.mp4
+
+    Args:
+        dataset: folder of the photographs or of a run.
+        out: folder to write; by default runs/NAME-trained, and RUN/training for a run.
+        minutes: time to train; the schedule follows the clock, so that two runs differ.
+        iterations: steps to train, one photograph each; 7,000 unless minutes are given. Such runs repeat bit for bit.
+        strategy: how Gaussians are added: default (clone and split), absgrad, mcmc (up to the cap), or fixed (none are
+            added). auto is fixed for a run, whose depth covers the surfaces, and default otherwise.
+        max_gaussians: largest number of Gaussians: quality for time and memory.
+        sh_degree: of view-dependent colour, 0 to 4.
+        scale: reduce the photographs to 1/S of their size.
+        background: behind photographs with alpha; auto is white for Blender scenes and black otherwise.
+        refine_poses: correct the camera poses; held-out views are aligned to the map before they are scored.
+        antialiased: compensate the low-pass filter in opacities, for views from other distances than the photographs'.
+        held_out_every: each K-th view is held out; 0 trains on all.
+        seed: of the random draws.
+        checkpoint_every: time between two checkpoints [s].
+        resume: continue this training; all other options are its own.
+        overwrite: replace the training that --out holds.
+        quiet: no progress and no summary, only errors.
+    """
+    if (dataset is None) == (resume is None):
+        raise InputError("give one of the two.", field="DATASET, --resume", hint="see `splatbot train --help`")
+    if not checkpoint_every > 0:
+        raise InputError(f"is {checkpoint_every:g}.", field="--checkpoint-every", hint="give seconds above 0")
+    check_output(out)
+
+    from splatbot.training.folder import TrainingFolder, TrainingSettings
+    from splatbot.training.options import TrainingOptions
+
+    if resume is not None:
+        folder = TrainingFolder(resume)
+        settings = folder.load_settings()
+        data, start = _open(settings.dataset, settings.scale)
+        options = settings.options
+    else:
+        assert dataset is not None
+        data, start = _open(dataset, scale)
+        is_run = data.kind == "run"
+        folder = TrainingFolder(out or (dataset / "training" if is_run else Path("runs") / f"{_name(dataset)}-trained"))
+        folder.check_free(overwrite=overwrite)
+        shade = "white" if data.kind == "blender" else "black"
+        options = TrainingOptions(
+            iterations=_DEFAULT_ITERATIONS if iterations is None and minutes is None else iterations,
+            minutes=minutes,
+            strategy=("fixed" if is_run else "default") if strategy == "auto" else strategy,
+            max_gaussians=max_gaussians,
+            sh_degree=sh_degree,
+            background=shade if background == "auto" else background,  # type: ignore[arg-type]
+            refine_poses=refine_poses,
+            antialiased=antialiased,
+            seed=seed,
+        )
+        settings = TrainingSettings(dataset.resolve(), scale, held_out_every, options)
+        folder.begin(settings)
+    return _train(data, folder, settings, start, checkpoint_every, resumed=resume is not None, quiet=quiet)
+
+
+def _open(dataset: Path, scale: int) -> tuple[TrainingData, GaussianModel | None]:
+    """Open the dataset, and the map that training starts from if it is that of a run."""
+    from splatbot.gaussians import GaussianModel
+    from splatbot.results.folder import RunFolder
+    from splatbot.robots.in_view import reopen_log
+    from splatbot.training.datasets import dataset_kind, open_dataset
+
+    if dataset_kind(dataset) != "run":
+        return open_dataset(dataset, scale=scale), None
+    run = RunFolder(dataset)
+    return open_dataset(dataset, scale=scale, log=reopen_log(run)), GaussianModel.load(run.map)
+
+
+def _train(
+    data: TrainingData,
+    folder: TrainingFolder,
+    settings: TrainingSettings,
+    start: GaussianModel | None,
+    checkpoint_every: float,
+    *,
+    resumed: bool,
+    quiet: bool,
+) -> int:
+    from splatbot.report.training import training_pictures
+    from splatbot.results.folder import RunFolder
+    from splatbot.run.interrupts import Interrupts
+    from splatbot.training.session import TrainingSession
+
+    with Interrupts() as interrupts, _progress(quiet) as report:
+        session = TrainingSession(data, folder, settings, start=start, checkpoint_s=checkpoint_every)
+        if resumed:
+            session.resume()
+        scores = session.run(report=report, stop=lambda: interrupts.requested is not None, pictures=training_pictures)
+    if data.kind == "run":
+        RunFolder(data.folder).replace_map(session.trainer.model)
+    if not quiet:
+        _print(folder, data, scores)
+    if not scores["complete"]:
+        print(f"interrupted; continue with: splatbot train --resume {folder.path}", file=sys.stderr)
+        return 128 + (interrupts.requested or 2)
+    return 0
+
+
+@contextmanager
+def _progress(quiet: bool) -> Iterator[Callable[[TrainingProgress], None]]:
+    """Yield a callback that shows a live bar on a terminal, and a plain line every ten seconds elsewhere."""
+    if quiet:
+        yield lambda progress: None
+        return
+    if not sys.stderr.isatty():
+        yield _PlainTraining()
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn
+
+    columns = (TextColumn("[bold]{task.description}"), BarColumn(bar_width=16), TextColumn("{task.fields[numbers]}"))
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bars:
+        task = bars.add_task("reading", total=1.0, numbers="")
+        yield lambda progress: bars.update(
+            task, description=progress.doing, completed=progress.share, numbers=_numbers(progress)
+        )
+
+
+class _PlainTraining:
+    def __init__(self) -> None:
+        self._due = 0.0
+
+    def __call__(self, progress: TrainingProgress) -> None:
+        import time
+
+        if time.monotonic() >= self._due:
+            self._due = time.monotonic() + 10.0
+            print(f"{progress.doing} {100 * progress.share:.0f} %  {_numbers(progress)}", file=sys.stderr, flush=True)
+
+
+def _numbers(progress: TrainingProgress) -> str:
+    row = progress.row
+    psnr = f"  PSNR {row.psnr_db:.2f} dB" if row.psnr_db is not None else ""
+    left = f"{int(progress.remaining_s) // 60}:{int(progress.remaining_s) % 60:02d} left" if progress.share > 0 else ""
+    return f"iteration {row.iteration:,}  loss {row.loss:.4f}{psnr}  {row.gaussians:,} Gaussians  {left}"
+
+
+def _print(folder: TrainingFolder, data: TrainingData, scores: dict[str, Any]) -> None:
+    from splatbot.cli.tables import print_table
+    from splatbot.results.units import count, decibels, number
+
+    rows = [
+        ("iterations", count(scores["iterations"])),
+        ("time of training", f"{scores['seconds'] / 60:.1f} min"),
+        ("Gaussians", f"{count(scores['gaussians'])}, SH degree {scores['sh_degree']}"),
+        ("held-out views", str(scores["held_out"])),
+        ("PSNR", decibels(scores["psnr_db"])),
+        ("SSIM", number(scores["ssim"], 3)),
+        ("map", str(data.folder / "map.ply" if data.kind == "run" else folder.map)),
+        ("pictures", ", ".join(str(folder.path / name) for name in ("held_out.jpg", "course.png"))),
+    ]
+    print_table(rows, title=str(folder.path))
+
+
+def _name(dataset: Path) -> str:
+    return dataset.resolve().name

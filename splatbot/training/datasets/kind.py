@@ -1,0 +1,43 @@
+"""Kinds of datasets, recognized by the names of their files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from splatbot.errors import InputError
+from splatbot.training.datasets.base import DatasetKind
+
+MODEL_FOLDERS = ("sparse/0", "sparse", ".", "0")
+"""Places of a COLMAP model in the folder of a scene, the preferred one first."""
+
+_RUN_FILES = ("map.ply", "trajectory.tum", "config.yaml")
+_EXPECTED = (
+    "give a folder with sparse/0/{cameras,images,points3D}.bin or .txt (COLMAP), transforms_train.json (Blender), "
+    "transforms.json (Nerfstudio, instant-ngp), or one that `splatbot map` wrote"
+)
+
+
+def dataset_kind(folder: Path) -> DatasetKind:
+    """Return the kind of a dataset.
+
+    Raises:
+        InputError: the folder does not exist or is of no known kind.
+    """
+    if not folder.is_dir():
+        problem = "is no folder" if folder.exists() else "does not exist"
+        raise InputError(f"{problem}.", file=folder, field="dataset", hint=_EXPECTED)
+    if colmap_model(folder) is not None:
+        return "colmap"
+    if (folder / "transforms_train.json").is_file():
+        return "blender"
+    if (folder / "transforms.json").is_file():
+        return "nerfstudio"
+    if all((folder / name).is_file() for name in _RUN_FILES):
+        return "run"
+    raise InputError("holds no dataset of a known kind.", file=folder, field="dataset", hint=_EXPECTED)
+
+
+def colmap_model(folder: Path) -> Path | None:
+    """Return the folder of the first COLMAP model of a scene, or None."""
+    places = [folder / name for name in MODEL_FOLDERS]
+    return next((place for place in places if any((place / f"cameras{s}").is_file() for s in (".bin", ".txt"))), None)

@@ -1,0 +1,187 @@
+"""The folder of a training run: settings, checkpoint, map, scores and the course of the training."""
+
+from __future__ import annotations
+
+import io
+import json
+import pickle
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from splatbot.atomic import atomic_write, replace_files, write_bytes, write_text
+from splatbot.checksums import check_file
+from splatbot.errors import FormatError, InputError
+from splatbot.formats.ply import save_ply
+from splatbot.gaussians import GaussianModel
+from splatbot.training.options import TrainingOptions
+from splatbot.trajectory import Trajectory
+
+_FORMAT = 1
+_HINT = "give a folder that `splatbot train` wrote"
+
+
+@dataclass(frozen=True)
+class TrainingSettings:
+    """What a training run was started with; ``--resume`` needs nothing else.
+
+    Args:
+        dataset: folder of the images, absolute.
+        scale: the images are 1/``scale`` of their size.
+        held_out_every: see :meth:`TrainingData.split`.
+        options: of the trainer.
+    """
+
+    dataset: Path
+    scale: int
+    held_out_every: int
+    options: TrainingOptions
+
+
+@dataclass(frozen=True)
+class ProgressRow:
+    """One line of ``progress.jsonl``.
+
+    Args:
+        iteration: iterations done.
+        seconds: time of training [s], without evaluations.
+        loss: mean loss since the last row.
+        psnr_db: mean over the held-out views [dB]; None if they were not scored.
+        gaussians: number of Gaussians.
+    """
+
+    iteration: int
+    seconds: float
+    loss: float
+    psnr_db: float | None
+    gaussians: int
+
+
+class TrainingFolder:
+    """Paths of a training run's files, with reading and writing. Every file is replaced atomically."""
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self.settings = self.path / "training.json"
+        self.checkpoint = self.path / "checkpoint.pt"
+        self.map = self.path / "map.ply"
+        self.trajectory = self.path / "trajectory.tum"
+        self.progress = self.path / "progress.jsonl"
+        self.scores = self.path / "scores.json"
+
+    def begin(self, settings: TrainingSettings) -> None:
+        """Create the folder for a new training; the checkpoint of an earlier one is removed.
+
+        Raises:
+            InputError: the folder cannot be written.
+        """
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            self.checkpoint.unlink(missing_ok=True)
+            self._save_settings(settings)
+        except OSError as error:
+            hint = "name another folder"
+            raise InputError(
+                f"cannot be written ({error.strerror}).", file=self.path, field="--out", hint=hint
+            ) from error
+
+    def _save_settings(self, settings: TrainingSettings) -> None:
+        values = {"format": _FORMAT} | asdict(settings) | {"dataset": str(settings.dataset)}
+        with atomic_write(self.settings) as file:
+            file.write(json.dumps(values, indent=2).encode())
+
+    def load_settings(self) -> TrainingSettings:
+        """Read ``training.json``.
+
+        Raises:
+            FormatError: it is missing or damaged.
+        """
+        try:
+            values = json.loads(self.settings.read_text())
+            if values["format"] != _FORMAT:
+                raise FormatError(
+                    f"is {values['format']!r}.", file=self.settings, field="format", hint="use a matching version"
+                )
+            known = {field.name for field in fields(TrainingOptions)}
+            options = TrainingOptions(**{k: v for k, v in values["options"].items() if k in known})
+            return TrainingSettings(
+                Path(values["dataset"]), int(values["scale"]), int(values["held_out_every"]), options
+            )
+        except OSError as error:
+            raise FormatError(f"cannot be read ({error.strerror}).", file=self.settings, hint=_HINT) from error
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise FormatError(f"is damaged ({error}).", file=self.settings, hint=_HINT) from error
+
+    def save_checkpoint(self, state: Mapping[str, Any]) -> None:
+        """Write all that the next iterations depend on."""
+        buffer = io.BytesIO()
+        torch.save(dict(state), buffer)
+        with atomic_write(self.checkpoint) as file:
+            file.write(buffer.getbuffer())
+
+    def load_checkpoint(self) -> dict[str, Any]:
+        """Read the checkpoint; only tensors and plain values are read, no code.
+
+        Raises:
+            FormatError: it is missing or damaged.
+        """
+        try:
+            state = torch.load(self.checkpoint, map_location="cpu", weights_only=True)
+        except OSError as error:
+            why = "the run ended before its first checkpoint" if self.settings.is_file() else error.strerror
+            hint = f"train again: splatbot train DATASET --out {self.path} --overwrite"
+            raise FormatError(f"cannot be read ({why}).", file=self.checkpoint, hint=hint) from error
+        except (RuntimeError, pickle.UnpicklingError, ValueError, EOFError, KeyError) as error:
+            hint = f"train again: splatbot train DATASET --out {self.path} --overwrite"
+            raise FormatError("is damaged.", file=self.checkpoint, field="checkpoint", hint=hint) from error
+        if not isinstance(state, dict) or "iteration" not in state:
+            raise FormatError("is no checkpoint of a training.", file=self.checkpoint, hint=_HINT)
+        return state
+
+    def save_results(
+        self,
+        model: GaussianModel,
+        trajectory: Trajectory,
+        rows: Sequence[ProgressRow],
+        scores: Mapping[str, Any],
+        pictures: Mapping[str, bytes],
+    ) -> None:
+        """Write the map, the poses of its images, the course of the training, the scores, and pictures by name."""
+        lines = "".join(json.dumps(asdict(row)) + "\n" for row in rows)
+        replace_files(
+            self.path,
+            {
+                self.map.name: lambda path: save_ply(model, path, bookkeeping=True),
+                self.trajectory.name: trajectory.save,
+                self.progress.name: write_text(lines),
+                self.scores.name: write_text(json.dumps(dict(scores), indent=2)),
+                **{name: write_bytes(data) for name, data in pictures.items()},
+            },
+        )
+
+    def load_progress(self) -> list[ProgressRow]:
+        """Read the course of the training; empty if there is none.
+
+        Raises:
+            FormatError: the file is damaged.
+        """
+        check_file(self.progress)
+        if not self.progress.is_file():
+            return []
+        try:
+            return [ProgressRow(**json.loads(line)) for line in self.progress.read_text().splitlines()]
+        except (ValueError, TypeError) as error:
+            raise FormatError(f"is damaged ({error}).", file=self.progress, hint="remove the file") from error
+
+    def check_free(self, *, overwrite: bool) -> None:
+        """Check that no other training is in the folder.
+
+        Raises:
+            InputError: there is one, and it may not be replaced.
+        """
+        if self.settings.exists() and not overwrite:
+            hint = f"continue it (--resume {self.path}), replace it (--overwrite), or name another folder"
+            raise InputError("holds a training already.", file=self.path, field="--out", hint=hint)

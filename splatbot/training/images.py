@@ -1,0 +1,106 @@
+"""Training images in memory: decoded once, with half, quarter and eighth sizes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from splatbot.camera import Camera
+from splatbot.training.datasets import TrainingView
+
+_LEAST_SIDE = 96  # [px] smaller images are not reduced further
+
+
+@dataclass(frozen=True, eq=False)
+class Photo:
+    """One image at one size.
+
+    Args:
+        camera: of this size.
+        rgb: (H, W, 3) float32 in 0..1, straight.
+        alpha: (H, W) float32 in 0..1, or None if the image is opaque.
+        trained: (H, W) bool, False where the image must not be trained on; or None for all.
+        depth: (H, W) [m], 0 without measurement; or None.
+    """
+
+    camera: Camera
+    rgb: Tensor
+    alpha: Tensor | None
+    trained: Tensor | None
+    depth: Tensor | None
+
+    def over(self, background: Tensor) -> Tensor:
+        """Return the image (H, W, 3) in front of a background colour (3,)."""
+        if self.alpha is None:
+            return self.rgb
+        return self.rgb * self.alpha[..., None] + background * (1 - self.alpha[..., None])
+
+
+class ImageCache:
+    """Reads each view once; keeps uint8 colours, and depth and masks, of each size that was asked for."""
+
+    def __init__(self, views: Sequence[TrainingView]) -> None:
+        self.views = tuple(views)
+        self._kept: dict[tuple[int, int], tuple[NDArray[np.uint8], NDArray[np.bool_] | None, Tensor | None]] = {}
+
+    def chosen(self, indices: Iterable[int]) -> ImageCache:
+        """Return a cache of some of the views, with what is known of them."""
+        indices = list(indices)
+        part = ImageCache([self.views[i] for i in indices])
+        for (index, reduce), kept in self._kept.items():
+            if index in indices:
+                part._kept[indices.index(index), reduce] = kept
+        return part
+
+    def photo(self, index: int, reduce: int = 1) -> Photo:
+        """Return view ``index`` at 1/``reduce`` of its size.
+
+        Raises:
+            SplatbotError: an image cannot be read.
+        """
+        view = self.views[index]
+        while reduce > 1 and min(view.camera.width, view.camera.height) // reduce < _LEAST_SIDE:
+            reduce //= 2
+        if (index, reduce) not in self._kept:
+            self._kept[index, reduce] = self._reduced(index, reduce)
+        image, left_out, depth = self._kept[index, reduce]
+        values = torch.from_numpy(image)
+        alpha = values[..., 3].float() / 255 if image.shape[2] == 4 else None
+        camera = view.camera if reduce == 1 else view.camera.resized(image.shape[1], image.shape[0])
+        trained = None if left_out is None else torch.from_numpy(~left_out)
+        return Photo(camera, values[..., :3].float() / 255, alpha, trained, depth)
+
+    def _reduced(self, index: int, reduce: int) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None, Tensor | None]:
+        view = self.views[index]
+        if reduce == 1:
+            depth = None if view.read_depth is None else torch.from_numpy(view.read_depth())
+            return view.read(), None if view.read_mask is None else view.read_mask(), depth
+        self.photo(index)
+        image, left_out, depth = self._kept[index, 1]
+        size = image.shape[1] // reduce, image.shape[0] // reduce
+        small = np.asarray(cv2.resize(_premultiplied(image), size, interpolation=cv2.INTER_AREA), dtype=np.float32)
+        if left_out is not None:
+            touched = cv2.resize(left_out.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+            left_out = np.asarray(touched) > 0
+        if depth is not None:  # an average across an edge is the depth of no surface
+            depth = torch.from_numpy(cv2.resize(depth.numpy(), size, interpolation=cv2.INTER_NEAREST))
+        return _straight(small), left_out, depth
+
+
+def _premultiplied(image: NDArray[np.uint8]) -> NDArray[np.float32]:
+    values = image.astype(np.float32)
+    if image.shape[2] == 4:
+        values[..., :3] *= values[..., 3:] / 255
+    return values
+
+
+def _straight(image: NDArray[np.float32]) -> NDArray[np.uint8]:
+    if image.shape[2] == 4:
+        image[..., :3] /= np.maximum(image[..., 3:] / 255, 1 / 255)
+    return np.clip(np.rint(image), 0, 255).astype(np.uint8)

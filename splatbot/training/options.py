@@ -1,0 +1,85 @@
+"""Settings of a training run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from splatbot.errors import InputError
+from splatbot.optimize.strategies import DefaultStrategy, FixedStrategy, MCMCStrategy, Strategy
+
+StrategyName = Literal["default", "absgrad", "mcmc", "fixed"]
+Background = Literal["black", "white", "random"]
+
+
+@dataclass(frozen=True)
+class TrainingOptions:
+    """What to train, and how long. A run ends at the first of ``iterations`` and ``minutes``.
+
+    Args:
+        iterations: steps of the optimizer, one image each; None for no limit.
+        minutes: time of training, without the evaluations; None for no limit. The schedule follows the clock then, so
+            that two runs differ.
+        strategy: "default" (Kerbl et al. 2023), "absgrad" (Ye et al. 2024), "mcmc" (Kheradmand et al. 2024), or
+            "fixed", which keeps the Gaussians of the start.
+        max_gaussians: largest number of Gaussians.
+        sh_degree: of the final map, 0 to 4; it grows from 0 in the course of the run.
+        background: behind images with alpha.
+        dssim_weight: λ of the loss (1 - λ) L1 + λ (1 - SSIM).
+        depth_weight: weight of the relative depth error where views have depth.
+        opacity_weight, scale_weight: weights of the mean opacity and the mean σ [1/m]; None for 0.01 with "mcmc" and 0
+            otherwise.
+        refine_poses: estimate a correction of each camera pose.
+        antialiased: render with opacities that compensate the low-pass filter (Yu et al. 2024).
+        coarse_share: share of the run at half the resolution or less.
+        seed: of all random draws.
+    """
+
+    iterations: int | None = 7_000
+    minutes: float | None = None
+    strategy: StrategyName = "default"
+    max_gaussians: int = 200_000
+    sh_degree: int = 3
+    background: Background = "black"
+    dssim_weight: float = 0.2
+    depth_weight: float = 0.1
+    opacity_weight: float | None = None
+    scale_weight: float | None = None
+    refine_poses: bool = False
+    antialiased: bool = False
+    coarse_share: float = 0.3
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.iterations is None and self.minutes is None:
+            raise InputError("has no end.", field="iterations", hint="give a number of iterations or of minutes")
+        for name, least, most in (
+            ("iterations", 1, 10_000_000),
+            ("minutes", 0.01, 100_000),
+            ("max_gaussians", 1, 20_000_000),
+            ("sh_degree", 0, 4),
+            ("dssim_weight", 0, 1),
+            ("depth_weight", 0, 100),
+            ("opacity_weight", 0, 100),
+            ("scale_weight", 0, 100),
+            ("coarse_share", 0, 1),
+        ):
+            value = getattr(self, name)
+            if value is not None and not least <= value <= most:
+                raise InputError(f"is {value:g}.", field=name, hint=f"give {least:g} to {most:g}")
+
+    @property
+    def regularizers(self) -> tuple[float, float]:
+        """Return the weights of opacities and scales."""
+        usual = 0.01 if self.strategy == "mcmc" else 0.0
+        opacity, scale = self.opacity_weight, self.scale_weight
+        return usual if opacity is None else opacity, usual if scale is None else scale
+
+    def make_strategy(self) -> Strategy:
+        """Return the strategy with its cap."""
+        if self.strategy == "fixed":
+            return FixedStrategy()
+        if self.strategy == "mcmc":
+            return MCMCStrategy(cap_max=self.max_gaussians)
+        absgrad = self.strategy == "absgrad"
+        return DefaultStrategy(cap_max=self.max_gaussians, absgrad=absgrad, grow_grad2d=0.0008 if absgrad else 0.0002)

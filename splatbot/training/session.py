@@ -1,0 +1,201 @@
+"""A whole training: from a dataset to a folder, with checkpoints."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from statistics import fmean
+from typing import Any
+
+import numpy as np
+
+from splatbot.gaussians import GaussianModel
+from splatbot.training.datasets import TrainingData
+from splatbot.training.folder import ProgressRow, TrainingFolder, TrainingSettings
+from splatbot.training.images import ImageCache
+from splatbot.training.initialize import initial_model
+from splatbot.training.options import TrainingOptions
+from splatbot.training.scoring import HeldOutScore, score_held_out, summary
+from splatbot.training.trainer import Trainer
+from splatbot.trajectory import Trajectory
+
+Pictures = Callable[[list[ProgressRow], list[HeldOutScore]], dict[str, bytes]]
+"""Draws pictures of a training by file name: a function of a higher layer."""
+
+
+@dataclass(frozen=True)
+class SessionConstants:
+    """Constants of a training session.
+
+    Args:
+        scored_times: number of times that the held-out views are scored in the course of a run.
+        scored_views: most views of each such time; at the end all are scored.
+        report_s: [s] time between two reports of progress.
+    """
+
+    scored_times: int = 10
+    scored_views: int = 8
+    report_s: float = 0.25
+
+
+CONSTANTS = SessionConstants()
+
+
+@dataclass(frozen=True)
+class TrainingProgress:
+    """Progress of a training.
+
+    Args:
+        row: the latest values.
+        share: of the run that is done, 0 to 1.
+        remaining_s: estimated rest of the run [s].
+        doing: "training", "scoring" or "saving".
+    """
+
+    row: ProgressRow
+    share: float
+    remaining_s: float
+    doing: str
+
+
+class TrainingSession:
+    """Trains until an end of the options, or until ``stop`` returns True; then scores and saves.
+
+    Args:
+        data: the dataset.
+        folder: where the results and checkpoints go.
+        settings: of the run; already saved in the folder.
+        start: the Gaussians of the start; None for the points of the dataset, or random ones.
+        checkpoint_s: time between two checkpoints [s].
+    """
+
+    def __init__(
+        self,
+        data: TrainingData,
+        folder: TrainingFolder,
+        settings: TrainingSettings,
+        *,
+        start: GaussianModel | None = None,
+        checkpoint_s: float = 60.0,
+    ) -> None:
+        self.options: TrainingOptions = settings.options
+        self.folder = folder
+        train, held_out = data.split(settings.held_out_every)
+        self.images, self.held_out = ImageCache(train), ImageCache(held_out)
+        if start is None:
+            start = initial_model(data, self.images, most=self.options.max_gaussians, seed=self.options.seed)
+        self.trainer = Trainer(start, self.images, self.options, data.scene_extent)
+        self.seconds = 0.0
+        self.rows: list[ProgressRow] = []
+        self._checkpoint_s = checkpoint_s
+        self._losses: list[float] = []
+
+    def resume(self) -> None:
+        """Continue from the checkpoint of the folder.
+
+        Raises:
+            FormatError: it is missing or damaged.
+        """
+        state = self.folder.load_checkpoint()
+        self.trainer.restore(state["trainer"])
+        self.seconds = state["seconds"]
+        self.rows = [ProgressRow(**row) for row in state["rows"]]
+        self._losses = state["losses"]
+
+    @property
+    def share(self) -> float:
+        """Return the share of the run that is done, 0 to 1."""
+        done = self.trainer.iteration / self.options.iterations if self.options.iterations else 0.0
+        clock = self.seconds / (60 * self.options.minutes) if self.options.minutes else 0.0
+        return min(1.0, max(done, clock))
+
+    def run(
+        self,
+        *,
+        report: Callable[[TrainingProgress], None] = lambda progress: None,
+        stop: Callable[[], bool] = lambda: False,
+        pictures: Pictures = lambda rows, scores: {},
+    ) -> dict[str, Any]:
+        """Train, score and save; return the scores.
+
+        Args:
+            report: receives the progress some times a second.
+            stop: called before each iteration; training ends once it returns True, and can be resumed.
+            pictures: draws the results.
+        """
+        saved = reported = time.monotonic()
+        while self.share < 1.0 and not stop():
+            began = time.perf_counter()
+            self._losses.append(self.trainer.step(self.share))
+            self.seconds += time.perf_counter() - began
+            if self.share >= (len(self.rows) + 1) / CONSTANTS.scored_times and self.share < 1.0:
+                report(self._progress("scoring"))
+                self._note(self._some_psnr())
+            now = time.monotonic()
+            if now - reported > CONSTANTS.report_s:
+                reported = now
+                report(self._progress("training"))
+            if now - saved > self._checkpoint_s:
+                report(self._progress("saving"))
+                self.save_checkpoint()
+                saved = time.monotonic()
+        self.save_checkpoint()
+        report(self._progress("scoring"))
+        return self.save_results(pictures)
+
+    def save_checkpoint(self) -> None:
+        """Write the state of the run to the folder."""
+        self.folder.save_checkpoint(
+            {
+                "iteration": self.trainer.iteration,
+                "trainer": self.trainer.state(),
+                "seconds": self.seconds,
+                "rows": [vars(row) for row in self.rows],
+                "losses": self._losses,
+            }
+        )
+
+    def save_results(self, pictures: Pictures) -> dict[str, Any]:
+        """Score all held-out views; write the map, the scores and the pictures; return the scores."""
+        model = self.trainer.model
+        scores = score_held_out(model, self.held_out, self.options, self.trainer.extent)
+        result = summary(scores)
+        rows = [*self.rows, self._row(result["psnr_db"])]
+        result |= {
+            "iterations": self.trainer.iteration,
+            "seconds": round(self.seconds, 1),
+            "gaussians": len(model),
+            "sh_degree": model.sh_degree,
+            "complete": self.share >= 1.0,
+        }
+        poses = self.trainer.poses.poses()
+        trajectory = Trajectory(np.arange(float(len(poses))), poses)
+        self.folder.save_results(model, trajectory, rows, result, pictures(rows, scores))
+        return result
+
+    def _some_psnr(self) -> float | None:
+        """Return the mean PSNR of some held-out views; None with refined poses, whose alignment takes long."""
+        views = self.held_out.views
+        if not views or self.options.refine_poses:
+            return None
+        step = -(-len(views) // CONSTANTS.scored_views)
+        some = self.held_out.chosen(range(0, len(views), step))
+        return fmean(
+            score.psnr_db for score in score_held_out(self.trainer.model, some, self.options, self.trainer.extent)
+        )
+
+    def _note(self, psnr_db: float | None) -> None:
+        self.rows.append(self._row(psnr_db))
+        self._losses = []
+
+    def _row(self, psnr_db: float | None) -> ProgressRow:
+        loss = fmean(self._losses) if self._losses else (self.rows[-1].loss if self.rows else 0.0)
+        model = self.trainer.model
+        return ProgressRow(self.trainer.iteration, round(self.seconds, 2), loss, psnr_db, len(model))
+
+    def _progress(self, doing: str) -> TrainingProgress:
+        psnr_db = next((row.psnr_db for row in reversed(self.rows) if row.psnr_db is not None), None)
+        share = self.share
+        remaining = self.seconds * (1 - share) / share if share > 0 else 0.0
+        return TrainingProgress(self._row(psnr_db), share, remaining, doing)

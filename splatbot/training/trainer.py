@@ -1,0 +1,244 @@
+"""Training: Adam on all Gaussians of a scene, one photograph a step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from splatbot.gaussians import GaussianModel
+from splatbot.optimize.adam import PARAMETERS, GaussianAdam
+from splatbot.optimize.losses import l1, l1_dssim
+from splatbot.optimize.strategies.edits import grow_harmonics
+from splatbot.rasterize import rasterization
+from splatbot.rasterize.meta import RenderMeta
+from splatbot.training.images import ImageCache, Photo
+from splatbot.training.options import TrainingOptions
+from splatbot.training.poses import CameraPoses
+
+_BACKGROUNDS = {"black": 0.0, "white": 1.0}
+
+
+@dataclass(frozen=True)
+class TrainerConstants:
+    """Constants of training; learning rates are those of Kerbl et al. 2023.
+
+    Args:
+        means_rate: at the start and at the end [share of the scene's extent]; exponential in between.
+        quats_rate, scales_rate, opacities_rate, dc_rate: constant rates of the other parameters.
+        rest_share: rate of the higher harmonics [share of ``dc_rate`` ].
+        pose_rate: at the start and at the end [rad]; exponential in between.
+        harmonics_share: share of the run after which the harmonics have their final degree.
+        covered_alpha: depth counts where the map covers a pixel more.
+        least_depth: [m] smaller depth does not increase the weight of its error further.
+    """
+
+    means_rate: tuple[float, float] = (1.6e-4, 1.6e-6)
+    quats_rate: float = 1e-3
+    scales_rate: float = 5e-3
+    opacities_rate: float = 5e-2
+    dc_rate: float = 2.5e-3
+    rest_share: float = 1 / 20
+    pose_rate: tuple[float, float] = (1e-3, 1e-5)
+    harmonics_share: float = 0.4
+    covered_alpha: float = 0.5
+    least_depth: float = 0.1
+
+
+CONSTANTS = TrainerConstants()
+
+
+class Trainer:
+    """The state of a training run. The same steps give the same bits, also across :meth:`state` and :meth:`restore`.
+
+    Args:
+        model: the Gaussians of the start; not changed.
+        images: the training views.
+        options: of the run.
+        extent: of the scene [m], see :attr:`TrainingData.scene_extent`.
+    """
+
+    def __init__(self, model: GaussianModel, images: ImageCache, options: TrainingOptions, extent: float) -> None:
+        self.model = model.clone()
+        self.images = images
+        self.options = options
+        self.extent = extent
+        self.iteration = 0
+        self.poses = CameraPoses([view.T_world_camera for view in images.views], extent)
+        self.adam = GaussianAdam(dict.fromkeys(PARAMETERS, 0.0))
+        self.adam.extend(self.model)
+        self.strategy = options.make_strategy()
+        self._growth = self.strategy.initialize_state(self.model, extent)
+        self._random = torch.Generator().manual_seed(options.seed)
+        self._order = torch.zeros(0, dtype=torch.int64)
+
+    def state(self) -> dict[str, Any]:
+        """Return all that the next steps depend on: tensors and numbers by name."""
+        steps, first, second = self.adam.state()
+        return {
+            "iteration": self.iteration,
+            "model": dict(((name, getattr(self.model, name)) for name in _MODEL)),
+            "adam": {"steps": steps, "first": first, "second": second, "skipped": self.adam.skipped},
+            "strategy": dict(self._growth),
+            "poses": {name: getattr(self.poses, name) for name in ("viewmats", "first", "second", "steps")},
+            "random": self._random.get_state(),
+            "order": self._order,
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go back to a :meth:`state`."""
+        self.iteration = state["iteration"]
+        self.model = GaussianModel(**state["model"])
+        adam = state["adam"]
+        self.adam.restore((adam["steps"], adam["first"], adam["second"]))
+        self.adam.skipped = adam["skipped"]
+        self._growth = dict(state["strategy"])
+        for name, value in state["poses"].items():
+            setattr(self.poses, name, value)
+        self._random.set_state(state["random"])
+        self._order = state["order"]
+
+    def step(self, progress: float) -> float:
+        """Run one iteration and return its loss.
+
+        PyTorch uses one thread meanwhile: its threads spin after each operation, which starves the rasterizer's.
+
+        Args:
+            progress: share of the run that is done, 0 to 1: rates, resolution and degree follow it.
+        """
+        threads = torch.get_num_threads()
+        torch.set_num_threads(1)
+        try:
+            loss = self._step(progress)
+        finally:
+            torch.set_num_threads(threads)
+        self.iteration += 1
+        return loss
+
+    def _step(self, progress: float) -> float:
+        index = self._next_view()
+        photo = self.images.photo(index, _reduction(progress, self.options.coarse_share))
+        degree = min(self.options.sh_degree, int(progress / CONSTANTS.harmonics_share * (self.options.sh_degree + 1)))
+        self.model = grow_harmonics(self.model, self.adam, degree)
+        self._set_rates(progress)
+        parameters = {name: getattr(self.model, name).requires_grad_(True) for name in PARAMETERS}
+        viewmat = self.poses.viewmats[index].clone().requires_grad_(self.options.refine_poses)
+        background = self._background()
+        render, alpha, meta = render_photo(
+            self.model, photo, viewmat, background, degree, antialiased=self.options.antialiased
+        )
+        loss = self._loss(render, alpha, photo, background)
+        self.strategy.step_pre_backward(self._growth, meta)
+        loss.backward()
+        grads = {name: parameter.grad for name, parameter in parameters.items()}
+        for parameter in parameters.values():
+            parameter.requires_grad_(False)
+            parameter.grad = None
+        if self.options.refine_poses and viewmat.grad is not None:
+            self.poses.step(index, viewmat.grad, _between(CONSTANTS.pose_rate, progress))
+        self._add_regularizers(grads)
+        self.adam.step(self.model, grads, meta["visibility"][0])
+        self.model = self.strategy.step_post_backward(
+            self.model, self.adam, self._growth, self.iteration, meta, progress=progress, random=self._random
+        )
+        return float(loss.detach())
+
+    def _next_view(self) -> int:
+        """Return the next view of a random order, in which each view comes once."""
+        if not len(self._order):
+            self._order = torch.randperm(len(self.images.views), generator=self._random)
+        index, self._order = int(self._order[0]), self._order[1:].clone()
+        return index
+
+    def _set_rates(self, progress: float) -> None:
+        c = CONSTANTS
+        rest = [c.dc_rate * c.rest_share] * (self.model.sh[0].numel() - 3) if len(self.model) else []
+        self.adam.rates = {
+            "means": _between(c.means_rate, progress) * self.extent,
+            "quats": c.quats_rate,
+            "log_scales": c.scales_rate,
+            "opacity_logits": c.opacities_rate,
+            "sh": [c.dc_rate] * 3 + rest if rest else c.dc_rate,
+        }
+
+    def _background(self) -> Tensor:
+        if self.options.background == "random":
+            return torch.rand(3, generator=self._random)
+        return torch.full((3,), _BACKGROUNDS[self.options.background])
+
+    def _loss(self, render: Tensor, alpha: Tensor, photo: Photo, background: Tensor) -> Tensor:
+        """Compute L = (1 - λ) L1 + λ (1 - SSIM) + w_d mean |(D - D*) / D*|, over the pixels that are trained on."""
+        loss = l1_dssim(render[..., :3].contiguous(), photo.over(background), self.options.dssim_weight, photo.trained)
+        if photo.depth is None or self.options.depth_weight == 0:
+            return loss
+        depth = photo.depth[..., None]
+        measured = (depth > 0) & (alpha.detach() > CONSTANTS.covered_alpha)
+        if photo.trained is not None:
+            measured &= photo.trained[..., None]
+        scale = depth.clamp_min(CONSTANTS.least_depth)
+        return loss + self.options.depth_weight * l1(render[..., 3:] / scale, depth / scale, measured)
+
+    def _add_regularizers(self, grads: dict[str, Tensor]) -> None:
+        """Add the gradients of w_o · mean o + w_s · mean σ."""
+        opacity, scale = self.options.regularizers
+        n = max(1, len(self.model))
+        if opacity > 0:
+            o = self.model.opacities
+            grads["opacity_logits"] += opacity / n * o * (1 - o)
+        if scale > 0:
+            grads["log_scales"] += scale / (3 * n) * self.model.scales
+
+
+_MODEL = ("means", "quats", "log_scales", "opacity_logits", "sh", "observations", "anchors", "uncertainty", "misses")
+
+
+def render_photo(
+    model: GaussianModel,
+    photo: Photo,
+    viewmat: Tensor,
+    background: Tensor,
+    degree: int,
+    *,
+    antialiased: bool = False,
+) -> tuple[Tensor, Tensor, RenderMeta]:
+    """Render the view of a photograph: colours (H, W, 3), with depth (H, W, 4) if it has depth, and alpha (H, W, 1).
+
+    Args:
+        model: the map.
+        photo: gives the camera, and whether depth is wanted.
+        viewmat: (4, 4) T_camera_world.
+        background: (3,) seen where the map is transparent.
+        degree: of the harmonics in use.
+        antialiased: whether opacities compensate the low-pass filter.
+    """
+    renders, alphas, meta = rasterization(
+        model.means,
+        model.quats,
+        model.log_scales.exp(),
+        torch.sigmoid(model.opacity_logits),
+        model.sh,
+        viewmat[None],
+        torch.from_numpy(photo.camera.K_corner)[None],
+        photo.camera.width,
+        photo.camera.height,
+        sh_degree=degree,
+        backgrounds=background[None],
+        render_mode="RGB" if photo.depth is None else "RGB+ED",
+        depth_mode="center" if photo.depth is None else "plane",
+        rasterize_mode="antialiased" if antialiased else "classic",
+    )
+    return renders[0], alphas[0], meta
+
+
+def _reduction(progress: float, coarse_share: float) -> int:
+    """Return the factor of the resolution: a quarter for the first third of ``coarse_share``, then a half, then all."""
+    if progress >= coarse_share:
+        return 1
+    return 4 if progress < coarse_share / 3 else 2
+
+
+def _between(ends: tuple[float, float], progress: float) -> float:
+    """Interpolate exponentially."""
+    return float(ends[0] * (ends[1] / ends[0]) ** min(1.0, max(0.0, progress)))
