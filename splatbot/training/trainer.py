@@ -41,7 +41,7 @@ class TrainerConstants:
     opacities_rate: float = 5e-2
     dc_rate: float = 2.5e-3
     rest_share: float = 1 / 20
-    pose_rate: tuple[float, float] = (1e-3, 1e-5)
+    pose_rate: tuple[float, float] = (2e-3, 2e-5)
     harmonics_share: float = 0.4
     covered_alpha: float = 0.5
     least_depth: float = 0.1

@@ -1,0 +1,146 @@
+"""`splatbot train` as a user runs it: to its end, with Ctrl-C, killed and resumed."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from splatbot.gaussians import GaussianModel
+from splatbot.training.folder import TrainingFolder
+from splatbot.trajectory import Trajectory
+from tests.unit.training.rendered import CAMERA, rendered_data
+from tests.waiting import until
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A Blender scene of 10 photographs with alpha."""
+    folder = tmp_path_factory.mktemp("blender")
+    frames = []
+    for view in rendered_data(10).views:
+        cv2.imwrite(str(folder / f"{view.name}.png"), cv2.cvtColor(view.read(), cv2.COLOR_RGBA2BGRA))
+        T = view.T_world_camera @ np.diag([1.0, -1.0, -1.0, 1.0])
+        frames.append({"file_path": f"./{view.name}", "transform_matrix": T.tolist()})
+    angle = 2 * np.arctan(0.5 * CAMERA.width / CAMERA.fx)
+    (folder / "transforms_train.json").write_text(json.dumps({"camera_angle_x": float(angle), "frames": frames}))
+    return folder
+
+
+def start(*words: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "splatbot", "train", *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+
+
+def finish(process: subprocess.Popen[str]) -> tuple[int, str, str]:
+    out, err = process.communicate(timeout=240)
+    return process.returncode, out, err
+
+
+def test_a_scene_becomes_a_map_with_scores_pictures_and_poses(scene: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    code, printed, err = finish(start(str(scene), "--iterations", "250", "--out", str(out)))
+    assert code == 0, err
+    assert "PSNR" in printed
+    scores = json.loads((out / "scores.json").read_text())
+    assert scores["complete"] is True
+    assert scores["iterations"] == 250
+    assert [view["name"] for view in scores["views"]] == ["000.png", "008.png"]
+    assert scores["psnr_db"] > 15  # eight photographs around a ball
+    model = GaussianModel.load(out / "map.ply")
+    assert len(model) == scores["gaussians"]
+    assert len(Trajectory.load(out / "trajectory.tum").stamps) == 8
+    for name in ("course.png", "held_out.jpg"):
+        image = cv2.imread(str(out / name))
+        assert image is not None
+        assert image.std() > 5
+    refused, _, err = finish(start(str(scene), "--iterations", "5", "--out", str(out)))
+    assert refused == 2
+    assert "holds a training already" in err
+    assert "--resume" in err
+
+
+def test_ctrl_c_keeps_the_trained_map_and_the_run_can_be_resumed(scene: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    process = start(str(scene), "--iterations", "1000000", "--checkpoint-every", "0.2", "--out", str(out))
+    until(lambda: (out / "checkpoint.pt").is_file())
+    process.send_signal(signal.SIGINT)
+    code, _, err = finish(process)
+    assert code == 130, err
+    assert f"--resume {out}" in err
+    scores = json.loads((out / "scores.json").read_text())
+    assert scores["complete"] is False
+    assert scores["iterations"] > 0
+    assert len(GaussianModel.load(out / "map.ply")) == scores["gaussians"]
+    process = start("--resume", str(out), "--checkpoint-every", "0.2")
+    before = (out / "checkpoint.pt").stat().st_mtime_ns
+    until(lambda: (out / "checkpoint.pt").stat().st_mtime_ns != before)
+    process.send_signal(signal.SIGINT)
+    assert finish(process)[0] == 130
+    assert json.loads((out / "scores.json").read_text())["iterations"] > scores["iterations"]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ((), "DATASET"),
+        (("nowhere",), "nowhere"),
+        (("{scene}", "--minutes", "-1"), "minutes"),
+        (("{scene}", "--scale", "0"), "scale"),
+        (("--resume", "{scene}"), "training.json"),
+        (("{scene}", "--held-out-every", "1"), "holds out all"),
+    ],
+)
+def test_wrong_input_is_named_with_a_fix(words: tuple[str, ...], message: str, scene: Path, tmp_path: Path) -> None:
+    given = [word.replace("{scene}", str(scene)) for word in words]
+    code, _, err = finish(start(*given, *(() if "--resume" in given else ("--out", str(tmp_path / "out")))))
+    assert code == 2, err
+    assert message in err
+    assert "Fix:" in err
+    assert "Traceback" not in err
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("strategy", ["default", "mcmc"])
+def test_a_run_killed_at_random_moments_ends_with_the_bits_of_one_that_was_not(
+    strategy: str, scene: Path, tmp_path: Path
+) -> None:
+    words = (
+        str(scene),
+        "--iterations",
+        "2000",
+        "--strategy",
+        strategy,
+        "--checkpoint-every",
+        "0.3",
+        "--max-gaussians",
+        "2000",
+    )
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    assert finish(start(*words, "--out", str(whole)))[0] == 0
+    rng = np.random.default_rng(4)
+    process = start(*words, "--out", str(cut))
+    until(lambda: (cut / "checkpoint.pt").is_file())
+    for _ in range(5):
+        time.sleep(float(rng.uniform(0.0, 1.0)))
+        os.kill(process.pid, signal.SIGKILL)
+        process.communicate()
+        before = TrainingFolder(cut).load_checkpoint()["iteration"]
+        process = start("--resume", str(cut), "--checkpoint-every", "0.3")
+        until(
+            lambda before=before: (
+                TrainingFolder(cut).load_checkpoint()["iteration"] > before or process.poll() is not None
+            )
+        )
+    code, _, err = finish(process)
+    assert code == 0, err
+    assert (cut / "map.ply").read_bytes() == (whole / "map.ply").read_bytes()
