@@ -36,6 +36,7 @@ BENCHMARKS = {
     "twin": Entry("splatbot.bench.twin", "Measure the twin: cost of each effect, error against the time step."),
     "raster": Entry("splatbot.bench.raster", "Measure the rasterizer: speed, and error against time."),
     "tracking": Entry("splatbot.bench.tracking", "Measure tracking: error against time, compared with other trackers."),
+    "training": Entry("splatbot.bench.training", "Measure training: quality of held-out views against seconds."),
     "collision": Entry("splatbot.bench.collision", "Measure the collision field: queries per second, errors."),
     "thin": Entry("splatbot.bench.thin", "Measure missed probes on thin, transparent and black objects."),
     "planning": Entry("splatbot.bench.planning", "Measure the planner: paths over time budgets, checked exactly."),

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import tyro
 
 from splatbot.cli.paths import check_camera, check_file, check_run
-from splatbot.layouts import log_kind
+from splatbot.layouts import TRAINING_NAME, log_kind
 
 
 def eval_run(
@@ -20,7 +20,7 @@ def eval_run(
     ground_truth: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> int:
-    """Score a run again: its trajectory against the reference, its map against the held-out frames.
+    """Score a run or a training again: the trajectory against the reference, the map against held-out views.
 
     Trajectory errors are after rigid alignment without scale, as `evo_ape tum REFERENCE RUN/trajectory.tum -a` has
     them. Held-out frames were tracked but never mapped; PSNR is over whole images.
@@ -29,14 +29,17 @@ def eval_run(
         splatbot eval runs/latest
         splatbot eval runs/desk --ground-truth better.tum
         splatbot eval runs/desk --log /mnt/recordings/desk --json
+        splatbot eval runs/lego-trained --json
 
     Args:
-        run: a folder that `splatbot map` wrote.
-        log: where the recording is now, if it was moved.
+        run: a folder that `splatbot map` or `splatbot train` wrote.
+        log: where the recording, or the dataset of a training, is now if it was moved.
         camera: intrinsics instead of those that the run used.
         ground_truth: TUM trajectory to compare with instead of the log's own.
         as_json: print JSON instead of a table.
     """
+    if (run / TRAINING_NAME).is_file():
+        return _eval_training(run, dataset=log, as_json=as_json)
     check_run(run)
     if log is not None:
         log_kind(log)
@@ -56,6 +59,31 @@ def eval_run(
         print(json.dumps(scores, indent=2, allow_nan=False))
     else:
         _print(str(run), scores)
+    return 0
+
+
+def _eval_training(folder: Path, *, dataset: str | None, as_json: bool) -> int:
+    """Score the map of a training on its held-out views, each and on average."""
+    from splatbot.cli.tables import print_table
+    from splatbot.gaussians import GaussianModel
+    from splatbot.results.units import decibels, number
+    from splatbot.training.datasets import open_dataset
+    from splatbot.training.folder import TrainingFolder
+    from splatbot.training.images import ImageCache
+    from splatbot.training.scoring import score_held_out, summary
+
+    training = TrainingFolder(folder)
+    settings = training.load_settings()
+    data = open_dataset(Path(dataset) if dataset else settings.dataset, scale=settings.scale)
+    _, held_out = data.split(settings.held_out_every)
+    model = GaussianModel.load(training.map)
+    scores = summary(score_held_out(model, ImageCache(held_out), settings.options, data.scene_extent))
+    if as_json:
+        print(json.dumps(scores, indent=2))
+        return 0
+    rows = [(view["name"], f"{decibels(view['psnr_db'])}, SSIM {number(view['ssim'], 3)}") for view in scores["views"]]
+    rows.append(("mean", f"{decibels(scores['psnr_db'])}, SSIM {number(scores['ssim'], 3)}"))
+    print_table(rows, title=f"{folder}: {scores['held_out']} held-out views")
     return 0
 
 

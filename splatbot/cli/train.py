@@ -49,8 +49,8 @@ def train(
     trained one; RUN/map.mapped.ply keeps the earlier one.
 
     Writes map.ply, trajectory.tum, scores.json, progress.jsonl, course.png and held_out.jpg. Held-out views are not
-    trained on: every eighth, or those that the dataset marks. Ctrl-C scores and saves what was trained; a run that was
-    killed loses at most the time since the last checkpoint. --resume continues both.
+    trained on: every eighth, or those that the dataset marks. Ctrl-C scores and saves the map as it is then. A killed
+    run loses at most the time since the last checkpoint. --resume continues both.
 
     Examples:
         splatbot train scenes/garden --minutes 10 --scale 4
@@ -66,8 +66,8 @@ def train(
         out: folder to write; by default runs/NAME-trained, and RUN/training for a run.
         minutes: time to train; the schedule follows the clock, so that two runs differ.
         iterations: steps to train, one photograph each; 7,000 unless minutes are given. Such runs repeat bit for bit.
-        strategy: how Gaussians are added: default (clone and split), absgrad, mcmc (up to the cap), or fixed (none are
-            added). auto is fixed for a run, whose depth covers the surfaces, and default otherwise.
+        strategy: default clones and splits, absgrad does the same by absolute gradients, mcmc grows to the cap, fixed
+            adds no Gaussians. auto selects fixed for a run and default for photographs.
         max_gaussians: largest number of Gaussians: quality for time and memory.
         sh_degree: of view-dependent colour, 0 to 4.
         scale: reduce the photographs to 1/S of their size.

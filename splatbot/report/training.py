@@ -1,4 +1,4 @@
-"""Pictures of a training: its course, and held-out photographs beside the map's renders."""
+"""Pictures of a training: its course, and held-out photographs next to renders of the map."""
 
 from __future__ import annotations
 

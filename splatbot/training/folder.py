@@ -17,6 +17,7 @@ from splatbot.checksums import check_file
 from splatbot.errors import FormatError, InputError
 from splatbot.formats.ply import save_ply
 from splatbot.gaussians import GaussianModel
+from splatbot.layouts import MAP_NAME, TRAINING_NAME
 from splatbot.training.options import TrainingOptions
 from splatbot.trajectory import Trajectory
 
@@ -26,7 +27,7 @@ _HINT = "give a folder that `splatbot train` wrote"
 
 @dataclass(frozen=True)
 class TrainingSettings:
-    """What a training run was started with; ``--resume`` needs nothing else.
+    """Dataset and options of a training run; ``--resume`` needs nothing else.
 
     Args:
         dataset: folder of the images, absolute.
@@ -65,9 +66,9 @@ class TrainingFolder:
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
-        self.settings = self.path / "training.json"
+        self.settings = self.path / TRAINING_NAME
         self.checkpoint = self.path / "checkpoint.pt"
-        self.map = self.path / "map.ply"
+        self.map = self.path / MAP_NAME
         self.trajectory = self.path / "trajectory.tum"
         self.progress = self.path / "progress.jsonl"
         self.scores = self.path / "scores.json"
@@ -163,7 +164,7 @@ class TrainingFolder:
         )
 
     def load_progress(self) -> list[ProgressRow]:
-        """Read the course of the training; empty if there is none.
+        """Read the course of the training; empty without the file.
 
         Raises:
             FormatError: the file is damaged.

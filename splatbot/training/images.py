@@ -43,14 +43,14 @@ class Photo:
 
 
 class ImageCache:
-    """Reads each view once; keeps uint8 colours, and depth and masks, of each size that was asked for."""
+    """Reads each view once; keeps uint8 colours, and depth and masks, of each size in use."""
 
     def __init__(self, views: Sequence[TrainingView]) -> None:
         self.views = tuple(views)
         self._kept: dict[tuple[int, int], tuple[NDArray[np.uint8], NDArray[np.bool_] | None, Tensor | None]] = {}
 
     def chosen(self, indices: Iterable[int]) -> ImageCache:
-        """Return a cache of some of the views, with what is known of them."""
+        """Return a cache of some of the views, with their decoded images."""
         indices = list(indices)
         part = ImageCache([self.views[i] for i in indices])
         for (index, reduce), kept in self._kept.items():

@@ -21,11 +21,12 @@ class InitialConstants:
     """Constants of the initial Gaussians.
 
     Args:
-        neighbours: a Gaussian's σ is the root mean square distance to so many nearest points.
+        neighbours: number of nearest points; a Gaussian's σ is the root mean square distance to them.
         opacity: of each Gaussian.
         random_points: number of points if a dataset has none.
         draws: points that are drawn for each that is kept; an object may fill a small part of the cube.
         half_size: half the side of their cube [share of the cameras' mean distance from the point they look at].
+        seen_share: share of the cameras that must see a random point.
         least_alpha: smaller alpha in an image shows that a point is empty space.
     """
 
@@ -34,6 +35,7 @@ class InitialConstants:
     random_points: int = 50_000
     draws: int = 10
     half_size: float = 0.5
+    seen_share: float = 0.25
     least_alpha: float = 0.02
 
 
@@ -78,14 +80,15 @@ def neighbour_distances(points: Array) -> Array:
 def random_points(images: ImageCache, count: int, random: np.random.Generator) -> Array:
     """Return points (M, 3), uniform in the cube around the point that the cameras look at.
 
-    Of some times as many, those are kept that no image with alpha shows as empty space: the visual hull.
+    More points are drawn than ``count``. Kept are those that a quarter of the cameras see and that no image with alpha
+    shows as empty space, the visual hull.
     """
     poses = np.stack([view.T_world_camera for view in images.views])
     center = looked_at(poses)
     half = CONSTANTS.half_size * float(np.linalg.norm(poses[:, :3, 3] - center, axis=1).mean())
     drawn = random.uniform(-half, half, (CONSTANTS.draws * count, 3)) + center
-    inside = _in_visual_hull(images, drawn)
-    return inside[:count] if len(inside) else drawn[:count]
+    kept = _in_visual_hull(images, drawn)
+    return kept[:count] if len(kept) else drawn[:count]
 
 
 def looked_at(poses: Array) -> Array:
@@ -109,18 +112,18 @@ def looked_at(poses: Array) -> Array:
 
 
 def _in_visual_hull(images: ImageCache, points: Array) -> Array:
-    """Return those of the points that no image with alpha shows as empty space."""
+    """Return those of the points that enough cameras see and that no image with alpha shows as empty space."""
+    views = np.zeros(len(points))
     for index, view in enumerate(images.views):
         photo = images.photo(index, 4)
-        if photo.alpha is None:
-            continue
         T_camera_world = inverse(view.T_world_camera)
         p = points @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]
         front = p[:, 2] > 1e-6
         u, v = photo.camera.project(np.where(front[:, None], p, [0.0, 0.0, 1.0])).round().astype(int).T
         seen = front & (u >= 0) & (v >= 0) & (u < photo.camera.width) & (v < photo.camera.height)
-        empty = photo.alpha.numpy() < CONSTANTS.least_alpha
-        outside = np.zeros(len(points), dtype=bool)
-        outside[seen] = empty[v[seen], u[seen]]
-        points = points[~outside]
-    return points
+        views += seen
+        if photo.alpha is not None:
+            empty = np.zeros(len(points), dtype=bool)
+            empty[seen] = photo.alpha.numpy()[v[seen], u[seen]] < CONSTANTS.least_alpha
+            points, views = points[~empty], views[~empty]
+    return points[views >= CONSTANTS.seen_share * len(images.views)]

@@ -14,7 +14,7 @@ Background = Literal["black", "white", "random"]
 
 @dataclass(frozen=True)
 class TrainingOptions:
-    """What to train, and how long. A run ends at the first of ``iterations`` and ``minutes``.
+    """Length and kind of a training. A run ends at the first of ``iterations`` and ``minutes``.
 
     Args:
         iterations: steps of the optimizer, one image each; None for no limit.

@@ -49,8 +49,8 @@ def score_held_out(
 ) -> list[HeldOutScore]:
     """Render each view of ``images`` and compare it with the photograph, over all pixels that may be trained on.
 
-    With refined poses the map is free to move as a whole, so that each view's pose is first aligned to the map
-    (Lin et al. 2021, BARF); the map does not change.
+    With refined poses the map is free to move as a whole. Each view's pose is then aligned to the map first (Lin et al.
+    2021, BARF).
 
     Args:
         model: the map.

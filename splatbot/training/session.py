@@ -92,7 +92,7 @@ class TrainingSession:
         self._losses: list[float] = []
 
     def resume(self) -> None:
-        """Continue from the checkpoint of the folder.
+        """Load the checkpoint of the folder.
 
         Raises:
             FormatError: it is missing or damaged.

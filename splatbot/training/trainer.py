@@ -79,7 +79,7 @@ class Trainer:
         steps, first, second = self.adam.state()
         return {
             "iteration": self.iteration,
-            "model": dict(((name, getattr(self.model, name)) for name in _MODEL)),
+            "model": {name: getattr(self.model, name) for name in _MODEL},
             "adam": {"steps": steps, "first": first, "second": second, "skipped": self.adam.skipped},
             "strategy": dict(self._growth),
             "poses": {name: getattr(self.poses, name) for name in ("viewmats", "first", "second", "steps")},
@@ -127,7 +127,13 @@ class Trainer:
         viewmat = self.poses.viewmats[index].clone().requires_grad_(self.options.refine_poses)
         background = self._background()
         render, alpha, meta = render_photo(
-            self.model, photo, viewmat, background, degree, antialiased=self.options.antialiased
+            self.model,
+            photo,
+            viewmat,
+            background,
+            degree,
+            antialiased=self.options.antialiased,
+            absgrad=self.strategy.absgrad,
         )
         loss = self._loss(render, alpha, photo, background)
         self.strategy.step_pre_backward(self._growth, meta)
@@ -202,6 +208,7 @@ def render_photo(
     degree: int,
     *,
     antialiased: bool = False,
+    absgrad: bool = False,
 ) -> tuple[Tensor, Tensor, RenderMeta]:
     """Render the view of a photograph: colours (H, W, 3), with depth (H, W, 4) if it has depth, and alpha (H, W, 1).
 
@@ -212,6 +219,7 @@ def render_photo(
         background: (3,) seen where the map is transparent.
         degree: of the harmonics in use.
         antialiased: whether opacities compensate the low-pass filter.
+        absgrad: whether the absolute gradients of the projected centres are needed.
     """
     renders, alphas, meta = rasterization(
         model.means,
@@ -228,6 +236,7 @@ def render_photo(
         render_mode="RGB" if photo.depth is None else "RGB+ED",
         depth_mode="center" if photo.depth is None else "plane",
         rasterize_mode="antialiased" if antialiased else "classic",
+        absgrad=absgrad,
     )
     return renders[0], alphas[0], meta
 

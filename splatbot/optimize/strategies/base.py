@@ -18,6 +18,11 @@ class Strategy(Protocol):
     ``random`` alone, so that a resumed run repeats them.
     """
 
+    @property
+    def absgrad(self) -> bool:
+        """Return whether :meth:`step_post_backward` needs the absolute gradients of the projected centres."""
+        ...
+
     def initialize_state(self, model: GaussianModel, scene_scale: float) -> dict[str, Any]:
         """Return the state before the first step: tensors and numbers by name."""
         ...

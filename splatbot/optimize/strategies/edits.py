@@ -1,7 +1,6 @@
 """Changes of the rows of a model, with the optimizer's moments: the steps that strategies are made of.
 
-Each function returns the changed model, changes ``adam`` in place, and leaves its ``model`` argument as it is or says
-so. New rows begin with moments of zero.
+Each function returns the changed model and changes ``adam`` in place. New rows begin with moments of zero.
 """
 
 from __future__ import annotations
@@ -98,7 +97,7 @@ def sample_add(
 
 
 def grow_harmonics(model: GaussianModel, adam: GaussianAdam, degree: int) -> GaussianModel:
-    """Continue the harmonics by zeros up to ``degree``."""
+    """Extend the harmonics by zeros up to ``degree``."""
     missing = (degree + 1) ** 2 - model.sh.shape[1]
     if missing <= 0:
         return model

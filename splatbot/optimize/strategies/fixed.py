@@ -14,12 +14,14 @@ from splatbot.rasterize.meta import RenderMeta
 class FixedStrategy:
     """Keeps the Gaussians of the start: for maps whose surface depth measurements already cover."""
 
+    absgrad = False
+
     def initialize_state(self, model: GaussianModel, scene_scale: float) -> dict[str, Any]:
         """Return an empty state."""
         return {}
 
     def step_pre_backward(self, state: dict[str, Any], meta: RenderMeta) -> None:
-        """Do nothing."""
+        """Keep nothing of the render."""
 
     def step_post_backward(
         self,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 
@@ -36,12 +36,14 @@ class MCMCStrategy:
     refine_every: int = 100
     min_opacity: float = 0.005
 
+    absgrad: ClassVar[bool] = False
+
     def initialize_state(self, model: GaussianModel, scene_scale: float) -> dict[str, Any]:
         """Return an empty state."""
         return {}
 
     def step_pre_backward(self, state: dict[str, Any], meta: RenderMeta) -> None:
-        """Do nothing."""
+        """Keep nothing of the render."""
 
     @torch.no_grad()
     def step_post_backward(
