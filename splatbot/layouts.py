@@ -10,14 +10,19 @@ from splatbot.errors import FormatError, LogError
 LogKind = Literal["synthetic", "bag", "tum", "replica"]
 
 MAP_NAME = "map.ply"
+TRAINING_NAME = "training.json"
+MAP_SUFFIXES = (".ply", ".splat", ".spz", ".sog", ".glb")
+"""Ends of the names of map files that splatbot.formats reads."""
+
+_SOG_NAME = "meta.json"  # of a map in a folder of WebP images
 _LAYOUTS_HINT = (
     "known layouts: rgb.txt with depth.txt (TUM), results/ with traj.txt (Replica), metadata.yaml (ROS 2), "
     "a .mcap or .bag file; "
     "`synthetic:tabletop` needs no files"
 )
 _AS_TUM = "write rgb/, depth/ (16-bit PNG), rgb.txt, depth.txt and intrinsics.json (docs/guide/mapping.md)"
-_FROM_A_LOG = "map a recording; splatbot reads Gaussians (3DGS PLY)"
-_AS_PLY = "open it in https://superspl.at/editor and export it as an uncompressed PLY"
+_FROM_A_LOG = f"map a recording; splatbot reads files of Gaussians ({', '.join(MAP_SUFFIXES)})"
+_AS_PLY = "open it in https://superspl.at/editor and export it as PLY"
 
 _PACKED = {
     ".zip": ("a ZIP archive", "unzip"),
@@ -44,15 +49,19 @@ _FOREIGN_LOGS = {
     ".r3d": ("a Record3D recording", f"export it in Record3D as EXR and RGB, then {_AS_TUM}"),
     ".rrd": ("a Rerun recording", f"export its images with the Rerun SDK, then {_AS_TUM}"),
     **dict.fromkeys((".mp4", ".mov", ".avi"), ("a video without depth", "record colour and depth of an RGB-D camera")),
-    ".ply": ("a map or a point cloud", "give the recording; `splatbot info FILE` describes a map"),
+    **dict.fromkeys(
+        MAP_SUFFIXES, ("a map or a point cloud", "give the recording; `splatbot info FILE` describes a map")
+    ),
 }
 _FOREIGN_MAPS = {
-    ".spz": ("a Niantic SPZ file", _AS_PLY),
-    ".splat": ("a .splat file", _AS_PLY),
     ".ksplat": ("a .ksplat file", _AS_PLY),
-    ".sog": ("a SOG file", _AS_PLY),
+    **dict.fromkeys(
+        (".usd", ".usda", ".usdc", ".usdz"),
+        ("an OpenUSD file", f"export its Gaussians in a format that splatbot reads ({', '.join(MAP_SUFFIXES)})"),
+    ),
+    ".gltf": ("a glTF file in several parts", "pack it as one .glb file"),
     **dict.fromkeys((".pcd", ".las", ".e57"), ("a point cloud", _FROM_A_LOG)),
-    **dict.fromkeys((".obj", ".stl", ".glb"), ("a mesh", _FROM_A_LOG)),
+    **dict.fromkeys((".obj", ".stl"), ("a mesh", _FROM_A_LOG)),
     ".bt": ("an OctoMap", _FROM_A_LOG),
 }
 
@@ -86,7 +95,7 @@ def log_kind(uri: str | Path) -> LogKind:
 
 
 def map_file(path: str | Path) -> Path:
-    """Return the map file that a path names: itself, or map.ply in the folder of a run.
+    """Return the map file that a path names: itself, map.ply in the folder of a run, or meta.json in that of a SOG.
 
     Raises:
         FormatError: it does not exist, or is of a format that is not supported.
@@ -95,6 +104,8 @@ def map_file(path: str | Path) -> Path:
     if place.is_dir():
         if (place / MAP_NAME).is_file():
             return place / MAP_NAME
+        if _is_sog(place):
+            return place / _SOG_NAME
         raise FormatError(f"has no {MAP_NAME}.", file=place, field="map", hint=_map_hint(place))
     if not place.exists():
         hint = "check the path; give a map file, or a folder that `splatbot map` wrote"
@@ -106,11 +117,15 @@ def map_file(path: str | Path) -> Path:
 
 
 def is_map(path: str | Path) -> bool:
-    """Return whether a path names a map or the folder of a run rather than a recording."""
+    """Return whether a path names a map, or the folder of a run or of a SOG, rather than a recording."""
     place = Path(path)
     if place.is_dir():
-        return (place / MAP_NAME).is_file()
-    return place.is_file() and (place.suffix.lower() == ".ply" or place.suffix.lower() in _FOREIGN_MAPS)
+        return (place / MAP_NAME).is_file() or _is_sog(place)
+    return place.is_file() and (place.suffix.lower() in MAP_SUFFIXES or place.suffix.lower() in _FOREIGN_MAPS)
+
+
+def _is_sog(folder: Path) -> bool:
+    return (folder / _SOG_NAME).is_file() and any(folder.glob("*.webp"))
 
 
 def _foreign(file: Path, kinds: dict[str, tuple[str, str]]) -> tuple[str, str] | None:
@@ -126,6 +141,8 @@ def _foreign_folder(folder: Path) -> tuple[str, str]:
     """Return the kind of a folder that is no supported log, and a fix."""
     if (folder / MAP_NAME).is_file():
         return "is the folder of a run", "give the recording; `splatbot info RUN` describes the map"
+    if _is_sog(folder):
+        return "is a SOG map", "give the recording; `splatbot info FOLDER` describes the map"
     if any((folder / name).exists() for name in ("transforms.json", "transforms_train.json")):
         return "is a Nerfstudio or NeRF scene, which has no depth", f"add depth: {_AS_TUM}"
     if any((folder / name).exists() for name in ("sparse", "database.db", "cameras.bin", "cameras.txt")):

@@ -25,7 +25,12 @@ class _Command(NamedTuple):
 # The summaries are here, not in the modules, because `splatbot --help` must not wait for torch or open3d.
 COMMANDS = {
     "map": _Command("splatbot.cli.map", "map_log_command", "Turn an RGB-D log into a Gaussian map and a run folder."),
-    "eval": _Command("splatbot.cli.eval", "eval_run", "Score a run again: trajectory error and held-out views."),
+    "train": _Command(
+        "splatbot.cli.train", "train", "Train a map from posed photographs, or improve the map of a run."
+    ),
+    "eval": _Command(
+        "splatbot.cli.eval", "eval_run", "Score a run or a training again: trajectory error and held-out views."
+    ),
     "audit": _Command("splatbot.cli.audit", "audit", "Check a map against measured depth: missed surface, false hits."),
     "render": _Command("splatbot.cli.render", "render", "Render a view of a map to a PNG."),
     "info": _Command("splatbot.cli.info", "info", "Describe a map, a log or a run."),
@@ -39,6 +44,7 @@ COMMANDS = {
     "grasp": _Command("splatbot.cli.grasp", "grasp", "Find grasps of a named or marked object in a map."),
     "objects": _Command("splatbot.cli.objects", "objects", "List the supports and objects of a map with their sizes."),
     "export": _Command("splatbot.cli.export", "export", "Write a map as mesh, points, distance grid or occupancy."),
+    "convert": _Command("splatbot.cli.convert", "convert", "Write a map in another format of Gaussian splats."),
     "demo": _Command("splatbot.cli.demo", "demo", "Record, map, serve and query a synthetic tabletop."),
     "robot": _Command("splatbot.cli.robot", "robot", "Add a robot arm from a URDF, or describe a stored one."),
     "plan-pick": _Command(

@@ -29,7 +29,7 @@ def train(
     minutes: Annotated[float | None, tyro.conf.arg(metavar="MIN")] = None,
     iterations: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
     strategy: Literal["auto", "default", "absgrad", "mcmc", "fixed"] = "auto",
-    max_gaussians: Annotated[int, tyro.conf.arg(metavar="N")] = 200_000,
+    max_gaussians: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
     sh_degree: Annotated[int, tyro.conf.arg(metavar="D")] = 3,
     scale: Annotated[int, tyro.conf.arg(metavar="S")] = 1,
     background: Literal["auto", "black", "white", "random"] = "auto",
@@ -66,9 +66,10 @@ def train(
         out: folder to write; by default runs/NAME-trained, and RUN/training for a run.
         minutes: time to train; the schedule follows the clock, so that two runs differ.
         iterations: steps to train, one photograph each; 7,000 unless minutes are given. Such runs repeat bit for bit.
-        strategy: default clones and splits, absgrad does the same by absolute gradients, mcmc grows to the cap, fixed
-            adds no Gaussians. auto selects fixed for a run and default for photographs.
-        max_gaussians: largest number of Gaussians: quality for time and memory.
+        strategy: default clones and splits Gaussians; absgrad does so by absolute gradients; mcmc grows to the cap;
+            fixed adds none. auto selects fixed for a run and default for photographs.
+        max_gaussians: largest number of Gaussians: quality for time and memory. By default one for each 100 pixels of
+            the training views, at most 200,000; few views do not determine more.
         sh_degree: of view-dependent colour, 0 to 4.
         scale: reduce the photographs to 1/S of their size.
         background: behind photographs with alpha; auto is white for Blender scenes and black otherwise.

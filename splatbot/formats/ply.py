@@ -12,28 +12,28 @@ The `vertex` element has these float32 properties:
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement, PlyParseError
 
 from splatbot.atomic import atomic_write
 from splatbot.checksums import check_file
 from splatbot.errors import FormatError
-from splatbot.gaussians.model import OPACITY_MAX, OPACITY_MIN, SCALE_MIN, GaussianModel
-
-Table = NDArray[np.float32]
-
-_log = logging.getLogger(__name__)
+from splatbot.formats.checks import MAX_GAUSSIANS, Table, check_finite, damaged, replace_degenerate
+from splatbot.formats.conventions import from_channel_major, to_channel_major
+from splatbot.gaussians.model import GaussianModel
 
 _MEANS, _NORMALS = ["x", "y", "z"], ["nx", "ny", "nz"]
 _DC = [f"f_dc_{i}" for i in range(3)]
 _SCALES, _QUATS = [f"scale_{i}" for i in range(3)], [f"rot_{i}" for i in range(4)]
 _REST_COUNTS = (0, 9, 24, 45, 72)  # 3 ((degree + 1)² - 1)
 _BOOKKEEPING = {"observations": 1, "anchors": -1, "uncertainty": 0, "misses": 0}  # with the value if absent
+
+_MAX_HEADER = 2**20  # bytes
+_SIZES = {"char": 1, "uchar": 1, "short": 2, "ushort": 2, "int": 4, "uint": 4, "float": 4, "double": 8}
+_SIZES |= {"int8": 1, "uint8": 1, "int16": 2, "uint16": 2, "int32": 4, "uint32": 4, "float32": 4, "float64": 8}
 
 
 def load_ply(path: str | Path) -> GaussianModel:
@@ -64,9 +64,9 @@ def load_ply(path: str | Path) -> GaussianModel:
     means, dc, f_rest, opacity, log_scales, quats = np.split(table, np.cumsum([3, 3, n_rest, 1, 3]), axis=1)
     if "observations" in present:
         _check_quats(path, quats)
-    _replace_degenerate(path, opacity, log_scales, quats)
-    _check_finite(path, table, names)
-    sh = np.concatenate([dc[:, None, :], f_rest.reshape(len(table), 3, n_rest // 3).transpose(0, 2, 1)], axis=1)
+    replace_degenerate(path, opacity, log_scales, quats)
+    check_finite(path, table, names)
+    sh = np.concatenate([dc[:, None, :], from_channel_major(f_rest)], axis=1)
     return GaussianModel(
         means=_tensor(means),
         quats=_tensor(quats),
@@ -87,7 +87,7 @@ def save_ply(model: GaussianModel, path: str | Path, *, normals: bool = True, bo
     """
     n = len(model)
     sh = model.sh.detach().numpy()
-    rest = sh[:, 1:].transpose(0, 2, 1).reshape(n, 3 * (sh.shape[1] - 1))
+    rest = to_channel_major(sh)
     columns = [
         (_MEANS, model.means.detach().numpy()),
         (_NORMALS if normals else [], np.zeros((n, 3 if normals else 0), np.float32)),
@@ -109,20 +109,57 @@ def save_ply(model: GaussianModel, path: str | Path, *, normals: bool = True, bo
         PlyData([element], byte_order="<").write(file)
 
 
-def _read_vertices(path: str | Path) -> PlyElement:
+def read_ply(path: str | Path) -> PlyData:
+    """Read any PLY file, after its header's counts are checked against the size of the file.
+
+    Raises:
+        FormatError: it cannot be read, is damaged or truncated, or claims too many rows.
+    """
     try:
-        ply = PlyData.read(str(path))
+        for element, count, least in read_ply_header(path):
+            if not 0 <= count <= MAX_GAUSSIANS or count * least > Path(path).stat().st_size:
+                raise damaged(path, element, f"the header claims {count:,} rows")
+        return PlyData.read(str(path))
     except OSError as error:
         raise FormatError(f"cannot be read ({error.strerror}).", file=path, hint="give a 3DGS PLY file") from error
-    except (PlyParseError, ValueError, MemoryError) as error:  # the latter two from a damaged header
-        raise FormatError(
-            f"is damaged or truncated ({error}).", file=path, field="vertex", hint="copy or export the file again"
-        ) from error
+    except (PlyParseError, ValueError, MemoryError, OverflowError) as error:  # of a damaged header
+        raise damaged(path, "vertex", error) from error
+
+
+def read_ply_header(path: str | Path) -> list[tuple[str, int, int]]:
+    """Read the elements of a PLY file: name, number of rows, and the least bytes that a row takes in the file.
+
+    Raises:
+        FormatError: the header is damaged or truncated.
+        OSError: the file cannot be read.
+    """
+    with Path(path).open("rb") as file:
+        header, end, _ = file.read(_MAX_HEADER).partition(b"end_header")
+    if not end:
+        raise damaged(path, "vertex", "the header has no end")
+    elements: list[tuple[str, int, int]] = []
+    is_text = False
+    try:
+        for line in header.decode("ascii", "replace").splitlines():
+            words = line.split()
+            if words[:1] == ["format"]:
+                is_text = words[1] == "ascii"
+            elif words[:1] == ["element"]:
+                elements.append((words[1], int(words[2]), 0))
+            elif words[:1] == ["property"]:
+                name, count, least = elements[-1]
+                size = _SIZES[words[2] if words[1] == "list" else words[1]]
+                elements[-1] = name, count, least + (1 if is_text else size)
+    except (LookupError, ValueError) as error:
+        raise damaged(path, "vertex", error) from error
+    return elements
+
+
+def _read_vertices(path: str | Path) -> PlyElement:
+    ply = read_ply(path)
     names = [element.name for element in ply.elements]
     if "chunk" in names:
-        raise FormatError(
-            "is a compressed PLY.", file=path, field="chunk", hint="export it as an uncompressed 3DGS PLY"
-        )
+        raise FormatError("is a compressed PLY.", file=path, field="chunk", hint="load it with load_gaussians")
     if "vertex" not in names:
         raise FormatError(f"has elements {names}, no vertex.", file=path, field="vertex", hint="give a 3DGS PLY file")
     return ply["vertex"]
@@ -170,35 +207,3 @@ def _check_quats(path: str | Path, quats: Table) -> None:
             field="rot_0",
             hint="restore the file from a copy, or map the log again",
         )
-
-
-def _replace_degenerate(path: str | Path, opacity: Table, log_scales: Table, quats: Table) -> None:
-    """Replace degenerate values with a clear meaning in place: zero quaternions, zero scales, infinite opacities."""
-    zero = ~quats.any(axis=1)
-    flat = np.isneginf(log_scales)
-    sure = np.isinf(opacity)
-    quats[zero] = (1.0, 0.0, 0.0, 0.0)
-    log_scales[flat] = np.log(SCALE_MIN)
-    bound = np.log(OPACITY_MAX / (1.0 - OPACITY_MAX)), np.log(OPACITY_MIN / (1.0 - OPACITY_MIN))
-    opacity[sure] = np.where(opacity[sure] > 0, *bound)
-    for count, replacement in (
-        (zero.sum(), "zero quaternions became the identity"),
-        (flat.sum(), f"scales of 0 became {SCALE_MIN} m"),
-        (sure.sum(), "infinite opacities became the nearest finite ones"),
-    ):
-        if count:
-            _log.warning("%s: %d %s", path, count, replacement)
-
-
-def _check_finite(path: str | Path, table: Table, names: list[str]) -> None:
-    finite = np.isfinite(table)
-    if finite.all():
-        return
-    bad = ~finite.all(axis=1)
-    row = int(np.argmax(bad))
-    raise FormatError(
-        f"{int(bad.sum())} of {len(table)} rows hold NaN or infinity, the first is row {row}.",
-        file=path,
-        field=names[int(np.argmin(finite[row]))],
-        hint="remove those rows, or export the map again",
-    )

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from splatbot.errors import InputError
 from splatbot.optimize.strategies import DefaultStrategy, FixedStrategy, MCMCStrategy, Strategy
+
+_MOST_GAUSSIANS = 200_000
+_PIXELS_EACH = 100
 
 StrategyName = Literal["default", "absgrad", "mcmc", "fixed"]
 Background = Literal["black", "white", "random"]
@@ -22,7 +25,8 @@ class TrainingOptions:
             that two runs differ.
         strategy: "default" (Kerbl et al. 2023), "absgrad" (Ye et al. 2024), "mcmc" (Kheradmand et al. 2024), or
             "fixed", which keeps the Gaussians of the start.
-        max_gaussians: largest number of Gaussians.
+        max_gaussians: largest number of Gaussians. None for one for each 100 pixels of the training views, at most
+            200,000: few views do not determine more, and held-out views get worse.
         sh_degree: of the final map, 0 to 4; it grows from 0 in the course of the run.
         background: behind images with alpha.
         dssim_weight: λ of the loss (1 - λ) L1 + λ (1 - SSIM).
@@ -38,7 +42,7 @@ class TrainingOptions:
     iterations: int | None = 7_000
     minutes: float | None = None
     strategy: StrategyName = "default"
-    max_gaussians: int = 200_000
+    max_gaussians: int | None = None
     sh_degree: int = 3
     background: Background = "black"
     dssim_weight: float = 0.2
@@ -75,11 +79,18 @@ class TrainingOptions:
         opacity, scale = self.opacity_weight, self.scale_weight
         return usual if opacity is None else opacity, usual if scale is None else scale
 
+    def capped(self, pixels: int) -> TrainingOptions:
+        """Return the options with ``max_gaussians`` for training views of so many pixels in all."""
+        if self.max_gaussians is not None:
+            return self
+        return replace(self, max_gaussians=max(1, min(_MOST_GAUSSIANS, pixels // _PIXELS_EACH)))
+
     def make_strategy(self) -> Strategy:
         """Return the strategy with its cap."""
         if self.strategy == "fixed":
             return FixedStrategy()
+        cap = self.max_gaussians or _MOST_GAUSSIANS
         if self.strategy == "mcmc":
-            return MCMCStrategy(cap_max=self.max_gaussians)
+            return MCMCStrategy(cap_max=cap)
         absgrad = self.strategy == "absgrad"
-        return DefaultStrategy(cap_max=self.max_gaussians, absgrad=absgrad, grow_grad2d=0.0008 if absgrad else 0.0002)
+        return DefaultStrategy(cap_max=cap, absgrad=absgrad, grow_grad2d=0.0008 if absgrad else 0.0002)

@@ -79,11 +79,13 @@ class TrainingSession:
         start: GaussianModel | None = None,
         checkpoint_s: float = 60.0,
     ) -> None:
-        self.options: TrainingOptions = settings.options
         self.folder = folder
         train, held_out = data.split(settings.held_out_every)
+        pixels = sum(view.camera.width * view.camera.height for view in train)
+        self.options: TrainingOptions = settings.options.capped(pixels)
         self.images, self.held_out = ImageCache(train), ImageCache(held_out)
         if start is None:
+            assert self.options.max_gaussians is not None
             start = initial_model(data, self.images, most=self.options.max_gaussians, seed=self.options.seed)
         self.trainer = Trainer(start, self.images, self.options, data.scene_extent)
         self.seconds = 0.0

@@ -33,7 +33,7 @@ class TrainingBenchSettings(Settings):
         minutes: Time of each training.
         knobs: Settings to vary, each around the default.
         scale: The images are reduced to 1/S of their size.
-        seed: Of the random draws.
+        seed: Seed of the random draws.
     """
 
     name: ClassVar[str] = "training"

@@ -25,7 +25,7 @@ from splatbot.training.session import TrainingSession
 
 VALUES: dict[Knob, Sequence[Any]] = {
     "strategy": ("default", "absgrad", "mcmc", "fixed"),
-    "max_gaussians": (12_500, 50_000, 200_000),
+    "max_gaussians": (10_000, 30_000, 100_000, 300_000),
     "sh_degree": (0, 1, 3),
     "coarse_share": (0.0, 0.15, 0.3, 0.6),
     "scale": (1, 2, 4),

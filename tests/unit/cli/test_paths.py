@@ -123,12 +123,32 @@ def test_a_folder_that_is_no_log_is_named(tmp_path: Path, inside: str, what: str
     assert what in str(refused.value)
 
 
-@pytest.mark.parametrize("name", ["a.spz", "a.splat", "a.ksplat", "a.sog"])
-def test_a_map_of_another_format_is_named_with_the_way_to_convert_it(tmp_path: Path, name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "fix"),
+    [("a.ksplat", "superspl"), ("a.usdz", r"\.spz, \.sog, \.glb"), ("a.gltf", r"one \.glb"), ("a.obj", r"\.glb")],
+)
+def test_a_map_of_another_format_is_named_with_the_way_to_convert_it(tmp_path: Path, name: str, fix: str) -> None:
     (tmp_path / name).touch()
     assert is_map(tmp_path / name)
-    with pytest.raises(FormatError, match="superspl"):
+    with pytest.raises(FormatError, match=rf"Fix: .*{fix}"):
         map_file(tmp_path / name)
+
+
+def test_the_folder_of_a_sog_is_a_map_and_no_recording(tmp_path: Path) -> None:
+    (tmp_path / "meta.json").touch()
+    assert not is_map(tmp_path)
+    (tmp_path / "sh0.webp").touch()
+    assert is_map(tmp_path)
+    assert map_file(tmp_path) == tmp_path / "meta.json"
+    with pytest.raises(LogError, match="is a SOG map"):
+        log_kind(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.spz", "a.splat", "a.sog", "a.glb"])
+def test_a_map_given_as_a_recording_is_named(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).touch()
+    with pytest.raises(LogError, match="splatbot info"):
+        log_kind(tmp_path / name)
 
 
 def test_a_recording_given_as_a_map_says_how_to_map_it(tmp_path: Path) -> None:

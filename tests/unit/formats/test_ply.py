@@ -245,10 +245,10 @@ def test_an_impossible_number_of_coefficients_is_refused(tmp_path: Path) -> None
 
 def test_compressed_ply_is_told_apart(data_root: Path) -> None:
     with pytest.raises(FormatError, match="compressed"):
-        load_gaussians(data_root / "splats" / "biker.compressed.ply")
+        load_ply(data_root / "splats" / "biker.compressed.ply")
 
 
-@pytest.mark.parametrize(("name", "content"), [("map.splat", b"\0" * 32), ("map.ply", b""), ("map.ply", b"NGSP1234")])
+@pytest.mark.parametrize(("name", "content"), [("map.bin", b"\0" * 32), ("map.ply", b""), ("map.splat", b"")])
 def test_an_unknown_format_lists_the_known_ones(tmp_path: Path, name: str, content: bytes) -> None:
     path = tmp_path / name
     path.write_bytes(content)
@@ -265,6 +265,20 @@ def test_a_missing_file_and_an_unknown_suffix_are_format_errors(tmp_path: Path) 
     with pytest.raises(FormatError, match=r"\.ply"):
         save_gaussians(random_model(), tmp_path / "map.obj")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("kind", ["ascii", "binary_little_endian"])
+@pytest.mark.parametrize("count", [-5, 50_000_001, 40_000_000, 2**40, 10**30])
+@pytest.mark.parametrize("property_", ["float x", "list uchar float x"])
+def test_a_count_that_the_file_cannot_hold_is_refused_before_it_is_read(
+    tmp_path: Path, kind: str, count: int, property_: str
+) -> None:
+    path = tmp_path / "map.ply"
+    header = f"ply\nformat {kind} 1.0\nelement vertex {count}\nproperty {property_}\nend_header\n1 2 3\n"
+    path.write_text(header)
+    with pytest.raises(FormatError, match=f"claims {count:,} rows") as caught:
+        load_gaussians(path)
+    assert (caught.value.file, caught.value.field) == (str(path), "vertex")
 
 
 def test_any_damage_of_the_header_is_a_format_error_or_harmless(tmp_path: Path, rng: np.random.Generator) -> None:
