@@ -144,9 +144,12 @@ def _foreign_folder(folder: Path) -> tuple[str, str]:
     if _is_sog(folder):
         return "is a SOG map", "give the recording; `splatbot info FOLDER` describes the map"
     if any((folder / name).exists() for name in ("transforms.json", "transforms_train.json")):
-        return "is a Nerfstudio or NeRF scene, which has no depth", f"add depth: {_AS_TUM}"
+        return (
+            "is a Nerfstudio or NeRF scene, which has no depth",
+            f"train a map from its images: splatbot train {folder}",
+        )
     if any((folder / name).exists() for name in ("sparse", "database.db", "cameras.bin", "cameras.txt")):
-        return "is a COLMAP scene, which has no depth", f"add depth: {_AS_TUM}"
+        return "is a COLMAP scene, which has no depth", f"train a map from its images: splatbot train {folder}"
     if any(folder.glob("*.color.*")) or any(folder.glob("frame-*.depth.*")):
         return "is a 7-Scenes sequence", f"rename its images: {_AS_TUM}"
     if (folder / "color").is_dir() and (folder / "depth").is_dir():

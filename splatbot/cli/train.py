@@ -66,8 +66,8 @@ def train(
         out: folder to write; by default runs/NAME-trained, and RUN/training for a run.
         minutes: time to train; the schedule follows the clock, so that two runs differ.
         iterations: steps to train, one photograph each; 7,000 unless minutes are given. Such runs repeat bit for bit.
-        strategy: default clones and splits Gaussians; absgrad does so by absolute gradients; mcmc grows to the cap;
-            fixed adds none. auto selects fixed for a run and default for photographs.
+        strategy: Default clones and splits Gaussians, absgrad by absolute gradients. Mcmc moves faint ones and grows to
+            the cap. Fixed adds none. Auto selects fixed for a run, mcmc for photographs, default for Blender scenes.
         max_gaussians: largest number of Gaussians: quality for time and memory. By default one for each 100 pixels of
             the training views, at most 200,000; few views do not determine more.
         sh_degree: of view-dependent colour, 0 to 4.
@@ -89,7 +89,7 @@ def train(
     check_output(out)
 
     from splatbot.training.folder import TrainingFolder, TrainingSettings
-    from splatbot.training.options import TrainingOptions
+    from splatbot.training.options import USUAL, TrainingOptions
 
     if resume is not None:
         folder = TrainingFolder(resume)
@@ -102,14 +102,13 @@ def train(
         is_run = data.kind == "run"
         folder = TrainingFolder(out or (dataset / "training" if is_run else Path("runs") / f"{_name(dataset)}-trained"))
         folder.check_free(overwrite=overwrite)
-        shade = "white" if data.kind == "blender" else "black"
+        chosen = {"strategy": strategy, "background": background}
         options = TrainingOptions(
+            **{**USUAL[data.kind], **{name: value for name, value in chosen.items() if value != "auto"}},
             iterations=_DEFAULT_ITERATIONS if iterations is None and minutes is None else iterations,
             minutes=minutes,
-            strategy=("fixed" if is_run else "default") if strategy == "auto" else strategy,
             max_gaussians=max_gaussians,
             sh_degree=sh_degree,
-            background=shade if background == "auto" else background,  # type: ignore[arg-type]
             refine_poses=refine_poses,
             antialiased=antialiased,
             seed=seed,

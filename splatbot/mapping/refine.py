@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ from splatbot.mapping.densify import PositionGradients
 from splatbot.mapping.keyframes import Keyframe
 from splatbot.optimize.adam import PARAMETERS, GaussianAdam
 from splatbot.optimize.losses import l1, l1_dssim
+from splatbot.optimize.surfaces import limit_normal_motion, limit_shape
 from splatbot.rasterize import rasterization
 
 Stop = Callable[[], bool]
@@ -157,8 +157,15 @@ class Refiner:
         means, normals = model.means.index_select(0, rows), shortest_axes(model, rows)
         with self._rows_restored_on_error(model, rows):
             self.adam.step(model, dict(zip(PARAMETERS, grads[: len(PARAMETERS)], strict=True)), visible)
-            self._limit_normal_motion(model, rows, means, normals)
-            self._limit_shape(model, keyframe, rows)
+            limit_normal_motion(model, rows, means, normals, self.config.normal_step_scale)
+            limit_shape(
+                model,
+                rows,
+                keyframe.viewmat[0],
+                float(keyframe.K[0, 0, 0]),
+                max_pixels=self.config.max_pixels,
+                thickness=self.config.thickness,
+            )
         return float(loss.detach())
 
     @contextmanager
@@ -173,34 +180,6 @@ class Refiner:
             for tensor, values in zip(tensors, before, strict=True):
                 tensor.index_copy_(0, rows, values)
             raise
-
-    def _limit_normal_motion(self, model: GaussianModel, rows: Tensor, means: Tensor, normals: Tensor) -> None:
-        """Scale the part of a step that moves means along their normals by ``normal_step_scale``.
-
-        μ' = μ + Δ - (1 - s) (nᵀ Δ) n. Depth fusion estimates the position along the normal from all depth images and
-        their noise. An iteration uses one image, whose colors hardly constrain the distance of a plain wall. Colors do
-        constrain the position along the surface.
-
-        Args:
-            rows: (M,) Gaussians that the iteration changed.
-            means, normals: (M, 3) before the step, [m] and unit vectors.
-        """
-        after = model.means.index_select(0, rows)
-        along = ((after - means) * normals).sum(1, keepdim=True)
-        model.means.index_copy_(0, rows, after.addcmul_(along, normals, value=self.config.normal_step_scale - 1))
-
-    def _limit_shape(self, model: GaussianModel, keyframe: Keyframe, rows: Tensor) -> None:
-        """Keep visible Gaussians thin discs, of no more than ``config.max_pixels`` in this keyframe.
-
-        The photometric loss does not: a needle in front of a plain wall changes no pixel, and a sphere looks like its
-        disc. But both reach into free space, and a sphere has no normal.
-        """
-        viewmat = keyframe.viewmat[0].to(torch.float32)
-        z = model.means[rows] @ viewmat[2, :3] + viewmat[2, 3]
-        limit = (self.config.max_pixels * z / float(keyframe.K[0, 0, 0])).log()
-        sizes, axes = torch.minimum(model.log_scales[rows], limit[:, None]).sort(1)
-        sizes[:, 0] = torch.minimum(sizes[:, 0], sizes[:, 1] + math.log(self.config.thickness))
-        model.log_scales[rows] = torch.empty_like(sizes).scatter_(1, axes, sizes)
 
     def _loss(self, render: Tensor, alpha: Tensor, keyframe: Keyframe) -> Tensor:
         """Compute the loss L = L_color + w_d · mean |(D - D*) / D*| over covered, static pixels.

@@ -2,11 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 from splatbot.errors import InputError
 from splatbot.optimize.strategies import DefaultStrategy, FixedStrategy, MCMCStrategy, Strategy
+from splatbot.training.datasets.base import DatasetKind
+
+USUAL: Mapping[DatasetKind, Mapping[str, Any]] = {
+    "run": {"strategy": "fixed", "depth_weight": 4.0, "keep_surfaces": True, "coarse_share": 0.0},
+    "blender": {"strategy": "default", "background": "white"},
+    "colmap": {"strategy": "mcmc"},
+    "nerfstudio": {"strategy": "mcmc"},
+}
+"""Options that suit a kind of dataset. The depth of a run covers its surfaces. Photographs of the real world have
+errors that clones follow into floaters; rendered ones do not."""
 
 _MOST_GAUSSIANS = 200_000
 _PIXELS_EACH = 100
@@ -31,6 +42,8 @@ class TrainingOptions:
         background: behind images with alpha.
         dssim_weight: λ of the loss (1 - λ) L1 + λ (1 - SSIM).
         depth_weight: weight of the relative depth error where views have depth.
+        keep_surfaces: limit the motion of Gaussians along their normals and keep them thin discs, as mapping does. The
+            collision field of a mapped log stays true.
         opacity_weight, scale_weight: weights of the mean opacity and the mean σ [1/m]; None for 0.01 with "mcmc" and 0
             otherwise.
         refine_poses: estimate a correction of each camera pose.
@@ -47,6 +60,7 @@ class TrainingOptions:
     background: Background = "black"
     dssim_weight: float = 0.2
     depth_weight: float = 0.1
+    keep_surfaces: bool = False
     opacity_weight: float | None = None
     scale_weight: float | None = None
     refine_poses: bool = False
@@ -80,7 +94,7 @@ class TrainingOptions:
         return usual if opacity is None else opacity, usual if scale is None else scale
 
     def capped(self, pixels: int) -> TrainingOptions:
-        """Return the options with ``max_gaussians`` for training views of so many pixels in all."""
+        """Return the options with ``max_gaussians`` for training views of ``pixels`` pixels in all."""
         if self.max_gaussians is not None:
             return self
         return replace(self, max_gaussians=max(1, min(_MOST_GAUSSIANS, pixels // _PIXELS_EACH)))

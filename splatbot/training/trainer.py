@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,9 +11,11 @@ import torch
 from torch import Tensor
 
 from splatbot.gaussians import GaussianModel
+from splatbot.gaussians.shape import shortest_axes
 from splatbot.optimize.adam import PARAMETERS, GaussianAdam
 from splatbot.optimize.losses import l1, l1_dssim
 from splatbot.optimize.strategies.edits import grow_harmonics
+from splatbot.optimize.surfaces import limit_normal_motion, limit_shape
 from splatbot.rasterize import rasterization
 from splatbot.rasterize.meta import RenderMeta
 from splatbot.training.images import ImageCache, Photo
@@ -33,6 +37,8 @@ class TrainerConstants:
         harmonics_share: share of the run after which the harmonics have their final degree.
         covered_alpha: depth counts where the map covers a pixel more.
         least_depth: [m] smaller depth does not increase the weight of its error further.
+        normal_step_scale, max_pixels, thickness: with ``keep_surfaces``, as in the section ``mapping`` of the
+            configuration.
     """
 
     means_rate: tuple[float, float] = (1.6e-4, 1.6e-6)
@@ -45,6 +51,9 @@ class TrainerConstants:
     harmonics_share: float = 0.4
     covered_alpha: float = 0.5
     least_depth: float = 0.1
+    normal_step_scale: float = 0.3
+    max_pixels: float = 6.0
+    thickness: float = 0.2
 
 
 CONSTANTS = TrainerConstants()
@@ -145,11 +154,25 @@ class Trainer:
         if self.options.refine_poses and viewmat.grad is not None:
             self.poses.step(index, viewmat.grad, _between(CONSTANTS.pose_rate, progress))
         self._add_regularizers(grads)
-        self.adam.step(self.model, grads, meta["visibility"][0])
+        with self._surfaces_kept(index, photo, meta["visible_ids"][0]):
+            self.adam.step(self.model, grads, meta["visibility"][0])
         self.model = self.strategy.step_post_backward(
             self.model, self.adam, self._growth, self.iteration, meta, progress=progress, random=self._random
         )
         return float(loss.detach())
+
+    @contextmanager
+    def _surfaces_kept(self, index: int, photo: Photo, rows: Tensor) -> Iterator[None]:
+        """Return a context that limits the step in its block if surfaces are to be kept."""
+        if not self.options.keep_surfaces:
+            yield
+            return
+        means, normals = self.model.means.index_select(0, rows), shortest_axes(self.model, rows)
+        yield
+        limit_normal_motion(self.model, rows, means, normals, CONSTANTS.normal_step_scale)
+        viewmat, focal = self.poses.viewmats[index], photo.camera.fx
+        limits = {"max_pixels": CONSTANTS.max_pixels, "thickness": CONSTANTS.thickness}
+        limit_shape(self.model, rows, viewmat, focal, **limits)
 
     def _next_view(self) -> int:
         """Return the next view of a random order, in which each view comes once."""

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from splatbot.gaussians import GaussianModel
+from splatbot.results.folder import RunFolder
 from splatbot.training.folder import TrainingFolder
 from splatbot.trajectory import Trajectory
 from tests.unit.training.rendered import CAMERA, rendered_data
@@ -141,3 +142,24 @@ def test_a_run_killed_at_random_moments_ends_with_the_bits_of_one_that_was_not(
     code, _, err = finish(process)
     assert code == 0, err
     assert (cut / "map.ply").read_bytes() == (whole / "map.ply").read_bytes()
+
+
+def test_the_map_of_a_run_is_improved_in_place_and_the_earlier_one_kept(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    words = ("synthetic:tabletop?frames=10&width=160&height=120", "--out", str(run), "--quiet")
+    subprocess.run([sys.executable, "-m", "splatbot", "map", *words], check=True, timeout=200)
+    mapped = (run / "map.ply").read_bytes()
+    folder = RunFolder(run)
+    before = GaussianModel.load(run / "map.ply")
+    code, printed, err = finish(start(str(run), "--iterations", "150"))
+    assert code == 0, err
+    assert str(run / "map.ply") in printed
+    assert (run / "map.mapped.ply").read_bytes() == mapped
+    after = GaussianModel.load(run / "map.ply")
+    assert len(after) == len(before)
+    assert after.sh_degree == 3
+    assert bool((after.observations == before.observations).all())
+    assert folder.check() is True  # the checksums are those of the new map
+    assert not folder.report.exists()
+    moved = (after.means - before.means).norm(dim=1)
+    assert 0 < float(moved.median()) < 0.005

@@ -139,12 +139,21 @@ def inject_noise(model: GaussianModel, scale: float, *, random: torch.Generator)
     The gate 1 / (1 + exp(-100 (0.005 - o))) is below 1e-6 for opacities above 0.15, which are left alone.
     """
     faint = (model.opacity_logits < math.log(0.15 / 0.85)).nonzero()[:, 0]
-    some = model.select(faint)
-    gate = torch.sigmoid(100 * (0.005 - some.opacities))
+    quats, log_scales, logits = (
+        tensor.index_select(0, faint) for tensor in (model.quats, model.log_scales, model.opacity_logits)
+    )
+    gate = torch.sigmoid(100 * (0.005 - torch.sigmoid(logits)))
     noise = torch.randn(len(faint), 3, generator=random) * (gate * scale)[:, None]
-    R, variances = rotations(some), (2 * some.log_scales).exp()
-    moved = R @ (variances[..., None] * (R.mT @ noise[..., None]))
-    model.means.index_add_(0, faint, moved[..., 0])
+    quats = torch.nn.functional.normalize(quats, dim=1)
+    w, v = quats[:, :1], quats[:, 1:]
+    local = _rotate(w, -v, noise) * (2 * log_scales).exp()
+    model.means.index_add_(0, faint, _rotate(w, v, local))
+
+
+def _rotate(w: Tensor, v: Tensor, x: Tensor) -> Tensor:
+    """Rotate vectors (N, 3) by unit quaternions w (N, 1), v (N, 3): x + 2 w v × x + 2 v × (v × x)."""
+    twice = 2 * torch.linalg.cross(v, x)
+    return x + w * twice + torch.linalg.cross(v, twice)
 
 
 def _draw(opacities: Tensor, count: int, random: torch.Generator) -> Tensor:

@@ -317,10 +317,10 @@ def test_an_error_within_a_refinement_iteration_leaves_the_map_and_the_optimizer
     model, adam = mapper.model.clone(), mapper._refiner.adam
     moments = {name: tensor.clone() for name, tensor in adam.first.items()}
 
-    def broken(*_: object) -> None:
+    def broken(*_: object, **__: object) -> None:
         raise MemoryError("on purpose")
 
-    monkeypatch.setattr(mapper._refiner, "_limit_shape", broken)
+    monkeypatch.setattr("splatbot.mapping.refine.limit_shape", broken)
     mapper.pending_iterations = 3
     with pytest.raises(MemoryError):
         mapper.step()
