@@ -58,6 +58,11 @@ def _table() -> GaussianModel:
     return colored(OBJECTS | {"can": CAN}, 24_000, {"can": (0.8, 0.1, 0.1)})
 
 
+def _formats(desk: Path) -> Names:
+    GaussianModel.load(desk / "map.ply").save(desk / "scene.spz")
+    return {}
+
+
 def _grasping(desk: Path) -> Names:
     return {"snapshot": _table(), "T_world_base": np.eye(4), "panda": panda, "observers": None}
 
@@ -92,6 +97,7 @@ def _tracking(desk: Path) -> Names:
 
 
 CONTEXTS: dict[str, Callable[[Path], Names]] = {
+    "docs/guide/formats.md": _formats,
     "docs/guide/grasping.md": _grasping,
     "docs/guide/mapping.md": _mapping,
     "docs/guide/picking.md": _picking,
