@@ -123,6 +123,8 @@ class MapLibrary:
             draft.mkdir()
             self._write(served, served.snapshot, draft)
             write_sums(draft, [path.name for path in draft.iterdir()])
+            if state.exists():  # an earlier save of this version ended before it was named
+                shutil.rmtree(state)
             replace(draft, state)
             with atomic_write(home / _CURRENT) as file:
                 file.write(state.name.encode())

@@ -256,6 +256,7 @@ class Runtime:
                 _log.error("%s", error)
             except Exception:  # a defect: the other maps are saved all the same, and this one is tried again
                 _log.exception("map %s cannot be saved", served.id)
+                self.library.failing[served.id] = "a defect of the service; its log has the traceback"
 
 
 def check_exposure(settings: ServiceSettings) -> None:

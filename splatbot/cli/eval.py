@@ -33,13 +33,13 @@ def eval_run(
 
     Args:
         run: a folder that `splatbot map` or `splatbot train` wrote.
-        log: where the recording, or the dataset of a training, is now if it was moved.
+        log: where the recording is now, if it was moved.
         camera: intrinsics instead of those that the run used.
         ground_truth: TUM trajectory to compare with instead of the log's own.
         as_json: print JSON instead of a table.
     """
     if (run / TRAINING_NAME).is_file():
-        return _eval_training(run, dataset=log, as_json=as_json)
+        return _eval_training(run, log=log, as_json=as_json)
     check_run(run)
     if log is not None:
         log_kind(log)
@@ -62,19 +62,19 @@ def eval_run(
     return 0
 
 
-def _eval_training(folder: Path, *, dataset: str | None, as_json: bool) -> int:
+def _eval_training(folder: Path, *, log: str | None, as_json: bool) -> int:
     """Score the map of a training on its held-out views, each and on average."""
+    from splatbot.cli.datasets import open_training_data
     from splatbot.cli.tables import print_table
     from splatbot.gaussians import GaussianModel
     from splatbot.results.units import decibels, number
-    from splatbot.training.datasets import open_dataset
     from splatbot.training.folder import TrainingFolder
     from splatbot.training.images import ImageCache
     from splatbot.training.scoring import score_held_out, summary
 
     training = TrainingFolder(folder)
     settings = training.load_settings()
-    data = open_dataset(Path(dataset) if dataset else settings.dataset, scale=settings.scale)
+    data = open_training_data(settings.dataset, settings.scale, log)
     _, held_out = data.split(settings.held_out_every)
     model = GaussianModel.load(training.map)
     scores = summary(score_held_out(model, ImageCache(held_out), settings.options, data.scene_extent))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -12,9 +13,10 @@ import tyro
 
 from splatbot.cli.paths import check_output
 from splatbot.errors import InputError
+from splatbot.layouts import MAP_NAME
 
 if TYPE_CHECKING:
-    from splatbot.gaussians import GaussianModel
+    from splatbot.results.folder import RunFolder
     from splatbot.training.datasets import TrainingData
     from splatbot.training.folder import TrainingFolder, TrainingSettings
     from splatbot.training.session import TrainingProgress
@@ -32,6 +34,7 @@ def train(
     max_gaussians: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
     sh_degree: Annotated[int, tyro.conf.arg(metavar="D")] = 3,
     scale: Annotated[int, tyro.conf.arg(metavar="S")] = 1,
+    log: Annotated[str | None, tyro.conf.arg(metavar="LOG")] = None,
     background: Literal["auto", "black", "white", "random"] = "auto",
     refine_poses: bool = False,
     antialiased: bool = False,
@@ -72,36 +75,36 @@ def train(
             the training views, at most 200,000; few views do not determine more.
         sh_degree: of view-dependent colour, 0 to 4.
         scale: reduce the photographs to 1/S of their size.
+        log: where the recording of a run is now, if it was moved.
         background: behind photographs with alpha; auto is white for Blender scenes and black otherwise.
         refine_poses: correct the camera poses; held-out views are aligned to the map before they are scored.
         antialiased: compensate the low-pass filter in opacities, for views from other distances than the photographs'.
         held_out_every: each K-th view is held out; 0 trains on all.
         seed: of the random draws.
         checkpoint_every: time between two checkpoints [s].
-        resume: continue this training; all other options are its own.
+        resume: continue this training; all other options are its own. Give DATASET only if it was moved.
         overwrite: replace the training that --out holds.
         quiet: no progress and no summary, only errors.
     """
-    if (dataset is None) == (resume is None):
-        raise InputError("give one of the two.", field="DATASET, --resume", hint="see `splatbot train --help`")
+    if dataset is None and resume is None:
+        raise InputError("is missing.", field="DATASET", hint="name a folder of photographs, or --resume a training")
     if not checkpoint_every > 0:
         raise InputError(f"is {checkpoint_every:g}.", field="--checkpoint-every", hint="give seconds above 0")
     check_output(out)
 
+    from splatbot.cli.datasets import open_training_data
     from splatbot.training.folder import TrainingFolder, TrainingSettings
     from splatbot.training.options import USUAL, TrainingOptions
 
     if resume is not None:
         folder = TrainingFolder(resume)
         settings = folder.load_settings()
-        data, start = _open(settings.dataset, settings.scale)
-        options = settings.options
+        if dataset is not None:  # it was moved
+            settings = replace(settings, dataset=dataset.resolve())
+        data = open_training_data(settings.dataset, settings.scale, log)
     else:
         assert dataset is not None
-        data, start = _open(dataset, scale)
-        is_run = data.kind == "run"
-        folder = TrainingFolder(out or (dataset / "training" if is_run else Path("runs") / f"{_name(dataset)}-trained"))
-        folder.check_free(overwrite=overwrite)
+        data = open_training_data(dataset, scale, log)
         chosen = {"strategy": strategy, "background": background}
         options = TrainingOptions(
             **{**USUAL[data.kind], **{name: value for name, value in chosen.items() if value != "auto"}},
@@ -113,52 +116,58 @@ def train(
             antialiased=antialiased,
             seed=seed,
         )
+        default = dataset / "training" if data.kind == "run" else Path("runs") / f"{dataset.resolve().name}-trained"
+        folder = TrainingFolder(out or default)
+        folder.check_free(overwrite=overwrite)
         settings = TrainingSettings(dataset.resolve(), scale, held_out_every, options)
-        folder.begin(settings)
-    return _train(data, folder, settings, start, checkpoint_every, resumed=resume is not None, quiet=quiet)
-
-
-def _open(dataset: Path, scale: int) -> tuple[TrainingData, GaussianModel | None]:
-    """Open the dataset, and the map that training starts from if it is that of a run."""
-    from splatbot.gaussians import GaussianModel
-    from splatbot.results.folder import RunFolder
-    from splatbot.robots.in_view import reopen_log
-    from splatbot.training.datasets import dataset_kind, open_dataset
-
-    if dataset_kind(dataset) != "run":
-        return open_dataset(dataset, scale=scale), None
-    run = RunFolder(dataset)
-    return open_dataset(dataset, scale=scale, log=reopen_log(run)), GaussianModel.load(run.map)
+    return _train(data, folder, settings, checkpoint_every, resumed=resume is not None, quiet=quiet)
 
 
 def _train(
     data: TrainingData,
     folder: TrainingFolder,
     settings: TrainingSettings,
-    start: GaussianModel | None,
     checkpoint_every: float,
     *,
     resumed: bool,
     quiet: bool,
 ) -> int:
+    from splatbot.gaussians import GaussianModel
     from splatbot.report.training import training_pictures
     from splatbot.results.folder import RunFolder
     from splatbot.run.interrupts import Interrupts
     from splatbot.training.session import TrainingSession
 
+    in_place = data.kind == "run" and settings.options.keeps_frame
     with Interrupts() as interrupts, _progress(quiet) as report:
-        session = TrainingSession(data, folder, settings, start=start, checkpoint_s=checkpoint_every)
-        if resumed:
-            session.resume()
-        scores = session.run(report=report, stop=lambda: interrupts.requested is not None, pictures=training_pictures)
-    if data.kind == "run":
-        RunFolder(data.folder).replace_map(session.trainer.model)
+        with interrupts.interruptible():
+            start = GaussianModel.load(RunFolder(data.folder).map) if data.kind == "run" else None
+            session = TrainingSession(data, folder, settings, start=start, checkpoint_s=checkpoint_every)
+            if resumed:
+                session.resume()
+            else:
+                folder.begin(settings)
+        session.run(report=report, stop=lambda: interrupts.requested is not None)
+        if in_place:
+            RunFolder(data.folder).replace_map(session.trainer.model)
+        with interrupts.interruptible(after=int(interrupts.requested is not None)):
+            scores = session.score(training_pictures, report)
+            if in_place:
+                _rescore(RunFolder(data.folder), data)
     if not quiet:
-        _print(folder, data, scores)
+        _print(folder, data.folder / MAP_NAME if in_place else folder.map, scores)
     if not scores["complete"]:
         print(f"interrupted; continue with: splatbot train --resume {folder.path}", file=sys.stderr)
         return 128 + (interrupts.requested or 2)
     return 0
+
+
+def _rescore(run: RunFolder, data: TrainingData) -> None:
+    """Write the figures of the trained map into ``metrics.json`` of its run."""
+    from splatbot.results.rescore import rescore
+    from splatbot.robots.in_view import reopen_log
+
+    run.save_metrics(run.load_metrics() | rescore(run, reopen_log(run)))
 
 
 @contextmanager
@@ -200,10 +209,11 @@ def _numbers(progress: TrainingProgress) -> str:
     return f"iteration {row.iteration:,}  loss {row.loss:.4f}{psnr}  {row.gaussians:,} Gaussians  {left}"
 
 
-def _print(folder: TrainingFolder, data: TrainingData, scores: dict[str, Any]) -> None:
+def _print(folder: TrainingFolder, map_: Path, scores: dict[str, Any]) -> None:
     from splatbot.cli.tables import print_table
     from splatbot.results.units import count, decibels, number
 
+    pictures = [folder.path / name for name in ("held_out.jpg", "course.png")]
     rows = [
         ("iterations", count(scores["iterations"])),
         ("time of training", f"{scores['seconds'] / 60:.1f} min"),
@@ -211,11 +221,7 @@ def _print(folder: TrainingFolder, data: TrainingData, scores: dict[str, Any]) -
         ("held-out views", str(scores["held_out"])),
         ("PSNR", decibels(scores["psnr_db"])),
         ("SSIM", number(scores["ssim"], 3)),
-        ("map", str(data.folder / "map.ply" if data.kind == "run" else folder.map)),
-        ("pictures", ", ".join(str(folder.path / name) for name in ("held_out.jpg", "course.png"))),
+        ("map", str(map_)),
+        ("pictures", "\n".join(str(path) for path in pictures if path.exists())),
     ]
     print_table(rows, title=str(folder.path))
-
-
-def _name(dataset: Path) -> str:
-    return dataset.resolve().name

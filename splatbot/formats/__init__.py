@@ -84,10 +84,10 @@ def load_gaussians(path: str | Path) -> GaussianModel:
     except OSError as error:
         raise FormatError(f"cannot be read ({error.strerror}).", file=path, hint="give a map file") from error
     module = next((module for start, module in _MAGIC.items() if magic.startswith(start)), None)
-    if module == "ply" and _has_chunks(place):
-        module = "compressed_ply"
-    if module is None and magic and place.suffix.lower() == ".splat":  # the only format without a magic number
+    if magic and place.suffix.lower() == ".splat":  # without a magic number: its first float may equal one of another
         module = "splat"
+    elif module == "ply" and _has_chunks(place):
+        module = "compressed_ply"
     if module is None:
         found = f"begins with {magic!r}" if magic else "is empty"
         hint = f"known formats: {_KNOWN}"

@@ -153,7 +153,8 @@ def _meta(path: str | Path, data: bytes) -> dict[str, Any]:
 def _decode(path: str | Path, meta: dict[str, Any], read: Reader, stored: int) -> SplatArrays:
     count = int(meta["count"])
     check_count(path, count, "count")
-    check_expansion(path, 4 * 5 * count, stored, "count")
+    bands = int(meta["shN"]["bands"]) if meta.get("shN") else 0
+    check_expansion(path, 4 * (11 + 3 * (bands + 1) ** 2) * count, stored, "count")
 
     def pixels(part: str, index: int = 0) -> NDArray[np.int64]:
         image = _read_image(path, meta[part]["files"][index], read, most=2 * count + 4096)

@@ -11,16 +11,13 @@ from splatbot.report.theme import BLUE, GREEN, figure, png, styled
 from splatbot.training.folder import ProgressRow
 from splatbot.training.scoring import HeldOutScore
 
-_SHOWN_VIEWS = 4
 _HEIGHT = 320  # [px] of one image
 
 
 def training_pictures(rows: list[ProgressRow], scores: list[HeldOutScore]) -> dict[str, bytes]:
     """Return the pictures of a training by file name: ``course.png`` and, with held-out views, ``held_out.jpg``."""
-    pictures = {"course.png": course_plot(rows)}
-    if scores:
-        pictures["held_out.jpg"] = held_out_picture(scores)
-    return pictures
+    pictures = {"course.png": course_plot(rows), "held_out.jpg": held_out_picture(scores)}
+    return {name: data for name, data in pictures.items() if data is not None}
 
 
 @styled
@@ -42,16 +39,17 @@ def course_plot(rows: Sequence[ProgressRow]) -> bytes:
     return png(fig)
 
 
-def held_out_picture(scores: Sequence[HeldOutScore]) -> bytes:
-    """Return a JPEG: in each row a held-out photograph, the render, and their absolute difference."""
-    step = -(-len(scores) // _SHOWN_VIEWS)
+def held_out_picture(scores: Sequence[HeldOutScore]) -> bytes | None:
+    """Return a JPEG: in each row a held-out photograph, the render, and their absolute difference; None without any."""
     rows = []
-    for score in scores[::step]:
-        difference = np.abs(score.image - score.render)
-        row = np.concatenate([score.image, score.render, difference], axis=1)
+    for images in (score.images for score in scores if score.images is not None):
+        image, render = images.astype(np.int16)
+        row = np.concatenate([image, render, np.abs(image - render)], axis=1).astype(np.uint8)
         height, width = row.shape[:2]
-        rows.append(cv2.resize(row, (round(width * _HEIGHT / height), _HEIGHT), interpolation=cv2.INTER_AREA))
+        size = round(width * _HEIGHT / height), _HEIGHT
+        rows.append(np.asarray(cv2.resize(row, size, interpolation=cv2.INTER_AREA)))
+    if not rows:
+        return None
     widest = max(row.shape[1] for row in rows)
-    padded = [np.pad(row, ((0, 0), (0, widest - row.shape[1]), (0, 0))) for row in rows]
-    picture = np.rint(255 * np.concatenate(padded).clip(0, 1)).astype(np.uint8)
+    picture = np.concatenate([np.pad(row, ((0, 0), (0, widest - row.shape[1]), (0, 0))) for row in rows])
     return bytes(cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])[1])

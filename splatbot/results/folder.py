@@ -131,7 +131,7 @@ class RunFolder:
                 self.metrics.name: write_text(_metrics_text(metrics)),
             },
             # a run that is killed from here on has no checksums
-            remove=(self.report.name, self.map_page.name, self.audit.name, SUMS),
+            remove=(self.report.name, self.map_page.name, self.audit.name, self.mapped.name, SUMS),
         )
         write_sums(self.path, self._files())
 

@@ -142,26 +142,24 @@ class TrainingFolder:
             raise FormatError("is no checkpoint of a training.", file=self.checkpoint, hint=_HINT)
         return state
 
-    def save_results(
-        self,
-        model: GaussianModel,
-        trajectory: Trajectory,
-        rows: Sequence[ProgressRow],
-        scores: Mapping[str, Any],
-        pictures: Mapping[str, bytes],
+    def save_map(self, model: GaussianModel, trajectory: Trajectory) -> None:
+        """Write the map and the poses of its images."""
+        writers = {
+            self.map.name: lambda path: save_ply(model, path, bookkeeping=True),
+            self.trajectory.name: trajectory.save,
+        }
+        replace_files(self.path, writers, remove=(self.scores.name,))
+
+    def save_scores(
+        self, rows: Sequence[ProgressRow], scores: Mapping[str, Any], pictures: Mapping[str, bytes]
     ) -> None:
-        """Write the map, the poses of its images, the course of the training, the scores, and pictures by name."""
-        lines = "".join(json.dumps(asdict(row)) + "\n" for row in rows)
-        replace_files(
-            self.path,
-            {
-                self.map.name: lambda path: save_ply(model, path, bookkeeping=True),
-                self.trajectory.name: trajectory.save,
-                self.progress.name: write_text(lines),
-                self.scores.name: write_text(json.dumps(dict(scores), indent=2)),
-                **{name: write_bytes(data) for name, data in pictures.items()},
-            },
-        )
+        """Write the course of the training, the scores, and pictures by name."""
+        lines = "".join(json.dumps(asdict(row), allow_nan=False) + "\n" for row in rows)
+        writers = {
+            self.progress.name: write_text(lines),
+            self.scores.name: write_text(json.dumps(dict(scores), indent=2, allow_nan=False)),
+        }
+        replace_files(self.path, writers | {name: write_bytes(data) for name, data in pictures.items()})
 
     def load_progress(self) -> list[ProgressRow]:
         """Read the course of the training; empty without the file.
@@ -178,11 +176,14 @@ class TrainingFolder:
             raise FormatError(f"is damaged ({error}).", file=self.progress, hint="remove the file") from error
 
     def check_free(self, *, overwrite: bool) -> None:
-        """Check that no other training is in the folder.
+        """Check that the folder holds no run, and no other training unless that may be replaced.
 
         Raises:
-            InputError: there is one, and it may not be replaced.
+            InputError: it does.
         """
+        if not self.settings.exists() and any((self.path / name).exists() for name in (MAP_NAME, "metrics.json")):
+            hint = "name another folder; `splatbot train RUN` without --out improves the map of a run"
+            raise InputError("holds a map already.", file=self.path, field="--out", hint=hint)
         if self.settings.exists() and not overwrite:
             hint = f"continue it (--resume {self.path}), replace it (--overwrite), or name another folder"
             raise InputError("holds a training already.", file=self.path, field="--out", hint=hint)

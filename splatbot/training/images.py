@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -12,7 +14,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splatbot.camera import Camera
-from splatbot.training.datasets import TrainingView
+from splatbot.errors import InputError
+from splatbot.training.datasets import TrainingData, TrainingView
 
 _LEAST_SIDE = 96  # [px] smaller images are not reduced further
 
@@ -91,6 +94,31 @@ class ImageCache:
         if depth is not None:  # an average across an edge is the depth of no surface
             depth = torch.from_numpy(cv2.resize(depth.numpy(), size, interpolation=cv2.INTER_NEAREST))
         return _straight(small), left_out, depth
+
+
+def check_memory(data: TrainingData) -> None:
+    """Check that the images of a dataset fit into the free memory: 4 bytes a pixel, 4 more of depth, and smaller sizes.
+
+    Raises:
+        InputError: they do not.
+    """
+    each = 8 if any(view.read_depth is not None for view in data.views) else 4
+    needed = 4 / 3 * each * sum(view.camera.width * view.camera.height for view in data.views)
+    free = _free_memory()
+    if free is not None and needed > 0.7 * free:
+        least = math.ceil(math.sqrt(needed / (0.7 * free)))
+        hint = f"reduce the images: --scale {2 ** math.ceil(math.log2(least))}, times a scale already given"
+        why = f"needs {needed / 1e9:.1f} GB for its images, and {free / 1e9:.1f} GB are free."
+        raise InputError(why, file=data.folder, field="--scale", hint=hint)
+
+
+def _free_memory() -> float | None:
+    """Return the free memory [bytes], or None where the system does not report it."""
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+    except OSError:
+        return None
+    return next((1024.0 * float(line.split()[1]) for line in lines if line.startswith("MemAvailable:")), None)
 
 
 def _premultiplied(image: NDArray[np.uint8]) -> NDArray[np.float32]:

@@ -81,6 +81,7 @@ class TrainingOptions:
             ("opacity_weight", 0, 100),
             ("scale_weight", 0, 100),
             ("coarse_share", 0, 1),
+            ("seed", 0, 2**31),
         ):
             value = getattr(self, name)
             if value is not None and not least <= value <= most:
@@ -92,6 +93,11 @@ class TrainingOptions:
         usual = 0.01 if self.strategy == "mcmc" else 0.0
         opacity, scale = self.opacity_weight, self.scale_weight
         return usual if opacity is None else opacity, usual if scale is None else scale
+
+    @property
+    def keeps_frame(self) -> bool:
+        """Return whether the trained map keeps surfaces and world frame of the start, so that it can replace it."""
+        return self.keep_surfaces and self.strategy == "fixed" and not self.refine_poses
 
     def capped(self, pixels: int) -> TrainingOptions:
         """Return the options with ``max_gaussians`` for training views of ``pixels`` pixels in all."""

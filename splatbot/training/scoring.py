@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from statistics import fmean
 from typing import Any
@@ -10,10 +10,12 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from splatbot.evaluation.image import psnr, ssim
 from splatbot.gaussians import GaussianModel
 from splatbot.optimize.losses import l1_dssim
+from splatbot.results.metrics import without_nan
 from splatbot.training.images import ImageCache, Photo
 from splatbot.training.options import TrainingOptions
 from splatbot.training.poses import CameraPoses
@@ -22,8 +24,6 @@ from splatbot.training.trainer import render_photo
 _ALIGN_STEPS = 60
 _ALIGN_RATES = 3e-3, 1e-4  # [rad] at the first and the last step
 
-Image = NDArray[np.float32]
-
 
 @dataclass(frozen=True, eq=False)
 class HeldOutScore:
@@ -31,23 +31,28 @@ class HeldOutScore:
 
     Args:
         name: of the view.
-        psnr_db: [dB].
-        ssim: 0 to 1.
-        image: (H, W, 3) the photograph, in 0..1.
-        render: (H, W, 3) the map from its pose.
+        psnr_db: over the pixels that may be trained on [dB].
+        ssim: over the whole image, 0 to 1, without pixels that may not be trained on; None if it was not wanted.
+        images: (2, H, W, 3) uint8, the photograph and the map from its pose; None if they were not wanted.
     """
 
     name: str
     psnr_db: float
-    ssim: float
-    image: Image
-    render: Image
+    ssim: float | None = None
+    images: NDArray[np.uint8] | None = None
 
 
 def score_held_out(
-    model: GaussianModel, images: ImageCache, options: TrainingOptions, extent: float
+    model: GaussianModel,
+    images: ImageCache,
+    options: TrainingOptions,
+    extent: float,
+    *,
+    psnr_only: bool = False,
+    shown: int = 0,
+    report: Callable[[int], None] = lambda done: None,
 ) -> list[HeldOutScore]:
-    """Render each view of ``images`` and compare it with the photograph, over all pixels that may be trained on.
+    """Render each view of ``images`` and compare it with the photograph; views without a counted pixel are left out.
 
     With refined poses the map is free to move as a whole. Each view's pose is then aligned to the map first (Lin et al.
     2021, BARF).
@@ -57,39 +62,54 @@ def score_held_out(
         images: the held-out views.
         options: of the training.
         extent: of the scene [m].
+        psnr_only: leave SSIM out.
+        shown: number of views, evenly spaced, whose images are kept.
+        report: receives the number of views done.
     """
+    if not images.views:
+        return []
     background = torch.full((3,), 1.0 if options.background == "white" else 0.0)
     poses = CameraPoses([view.T_world_camera for view in images.views], extent)
+    kept = set(np.linspace(0, len(images.views) - 1, min(shown, len(images.views))).round().astype(int).tolist())
     scores = []
     for index, view in enumerate(images.views):
+        report(index)
         photo = images.photo(index)
+        if photo.trained is not None and not photo.trained.any():
+            continue
         if options.refine_poses:
             _align(model, photo, poses, index, background, options)
         with torch.no_grad():
             render, _, _ = render_photo(
-                model,
-                photo,
-                poses.viewmats[index],
-                background,
-                model.sh_degree,
-                antialiased=options.antialiased,
+                model, photo, poses.viewmats[index], background, model.sh_degree, antialiased=options.antialiased
             )
-        image, shown = photo.over(background).numpy(), render[..., :3].clamp(0, 1).numpy()
-        if photo.trained is not None:
-            shown = np.where(photo.trained.numpy()[..., None], shown, image)
-        scores.append(HeldOutScore(view.name, psnr(shown, image), ssim(shown, image), image, shown))
+        image, render = photo.over(background), render[..., :3].clamp(0, 1).contiguous()
+        counted = slice(None) if photo.trained is None else photo.trained
+        scores.append(
+            HeldOutScore(
+                view.name,
+                psnr(render[counted].numpy(), image[counted].numpy()),
+                None if psnr_only else _ssim(render, image, photo),
+                (255 * torch.stack([image, render])).round().to(torch.uint8).numpy() if index in kept else None,
+            )
+        )
     return scores
 
 
 def summary(scores: list[HeldOutScore]) -> dict[str, Any]:
     """Return the means and the single values of scores, for JSON; the means are None without views."""
-    values: Mapping[str, list[float]] = {
-        "psnr_db": [score.psnr_db for score in scores],
-        "ssim": [score.ssim for score in scores],
-    }
+    values = {"psnr_db": [s.psnr_db for s in scores], "ssim": [s.ssim or 0.0 for s in scores]}
     means = {name: round(fmean(of), 4) if of else None for name, of in values.items()}
-    views = [{"name": s.name, "psnr_db": round(s.psnr_db, 4), "ssim": round(s.ssim, 4)} for s in scores]
-    return {"held_out": len(scores), **means, "views": views}
+    views = [{"name": s.name, "psnr_db": round(s.psnr_db, 4), "ssim": round(s.ssim or 0.0, 4)} for s in scores]
+    found: dict[str, Any] = without_nan({"held_out": len(scores), **means, "views": views})
+    return found
+
+
+def _ssim(render: Tensor, image: Tensor, photo: Photo) -> float:
+    """Compute the mean SSIM of all windows inside the image, or with a mask of the windows at counted pixels."""
+    if photo.trained is None:
+        return ssim(render.numpy(), image.numpy())
+    return float(1 - l1_dssim(render, image, 1.0, photo.trained))
 
 
 def _align(
@@ -97,7 +117,7 @@ def _align(
     photo: Photo,
     poses: CameraPoses,
     index: int,
-    background: torch.Tensor,
+    background: Tensor,
     options: TrainingOptions,
 ) -> None:
     """Move the pose of a view to where the map looks most like the photograph."""

@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from splatbot.errors import InputError
 from splatbot.gaussians import GaussianModel
 from splatbot.training.datasets import TrainingData
 from splatbot.training.folder import ProgressRow, TrainingFolder, TrainingSettings
-from splatbot.training.images import ImageCache
+from splatbot.training.images import ImageCache, check_memory
 from splatbot.training.initialize import initial_model
 from splatbot.training.options import TrainingOptions
 from splatbot.training.scoring import HeldOutScore, score_held_out, summary
@@ -31,11 +32,13 @@ class SessionConstants:
     Args:
         scored_times: number of times that the held-out views are scored in the course of a run.
         scored_views: most views of each such time; at the end all are scored.
+        shown_views: number of held-out views in the pictures.
         report_s: [s] time between two reports of progress.
     """
 
     scored_times: int = 10
     scored_views: int = 8
+    shown_views: int = 4
     report_s: float = 0.25
 
 
@@ -50,7 +53,7 @@ class TrainingProgress:
         row: the latest values.
         share: of the run that is done, 0 to 1.
         remaining_s: estimated rest of the run [s].
-        doing: "training", "scoring" or "saving".
+        doing: "training", "saving", or "scoring" with its progress.
     """
 
     row: ProgressRow
@@ -60,7 +63,7 @@ class TrainingProgress:
 
 
 class TrainingSession:
-    """Trains until an end of the options, or until ``stop`` returns True; then scores and saves.
+    """Trains until an end of the options, or until ``stop`` returns True; saves, and scores.
 
     Args:
         data: the dataset.
@@ -79,8 +82,9 @@ class TrainingSession:
         start: GaussianModel | None = None,
         checkpoint_s: float = 60.0,
     ) -> None:
-        self.folder = folder
+        self.data, self.folder = data, folder
         train, held_out = data.split(settings.held_out_every)
+        check_memory(data)
         pixels = sum(view.camera.width * view.camera.height for view in train)
         self.options: TrainingOptions = settings.options.capped(pixels)
         self.images, self.held_out = ImageCache(train), ImageCache(held_out)
@@ -94,16 +98,26 @@ class TrainingSession:
         self._losses: list[float] = []
 
     def resume(self) -> None:
-        """Load the checkpoint of the folder.
+        """Load the checkpoint of the folder; without one, the training begins again.
 
         Raises:
-            FormatError: it is missing or damaged.
+            FormatError: it is damaged.
+            InputError: the images are not those that the training began with.
         """
+        if not self.folder.checkpoint.exists():
+            return
         state = self.folder.load_checkpoint()
+        if state["views"] != self._views():
+            hint = "restore the images, or train again (--overwrite)"
+            raise InputError("has other images than at the start.", file=self.data.folder, field="--resume", hint=hint)
         self.trainer.restore(state["trainer"])
         self.seconds = state["seconds"]
         self.rows = [ProgressRow(**row) for row in state["rows"]]
         self._losses = state["losses"]
+
+    def _views(self) -> list[str]:
+        """Return name and size of each training view."""
+        return [f"{view.name} {view.camera.width}x{view.camera.height}" for view in self.images.views]
 
     @property
     def share(self) -> float:
@@ -117,14 +131,12 @@ class TrainingSession:
         *,
         report: Callable[[TrainingProgress], None] = lambda progress: None,
         stop: Callable[[], bool] = lambda: False,
-        pictures: Pictures = lambda rows, scores: {},
-    ) -> dict[str, Any]:
-        """Train, score and save; return the scores.
+    ) -> None:
+        """Train, and save the checkpoint and the map.
 
         Args:
             report: receives the progress some times a second.
             stop: called before each iteration; training ends once it returns True, and can be resumed.
-            pictures: draws the results.
         """
         saved = reported = time.monotonic()
         while self.share < 1.0 and not stop():
@@ -143,8 +155,7 @@ class TrainingSession:
                 self.save_checkpoint()
                 saved = time.monotonic()
         self.save_checkpoint()
-        report(self._progress("scoring"))
-        return self.save_results(pictures)
+        self.save_map()
 
     def save_checkpoint(self) -> None:
         """Write the state of the run to the folder."""
@@ -152,17 +163,31 @@ class TrainingSession:
             {
                 "iteration": self.trainer.iteration,
                 "trainer": self.trainer.state(),
+                "views": self._views(),
                 "seconds": self.seconds,
                 "rows": [vars(row) for row in self.rows],
                 "losses": self._losses,
             }
         )
 
-    def save_results(self, pictures: Pictures) -> dict[str, Any]:
-        """Score all held-out views; write the map, the scores and the pictures; return the scores."""
-        model = self.trainer.model
-        scores = score_held_out(model, self.held_out, self.options, self.trainer.extent)
-        result = summary(scores)
+    def save_map(self) -> None:
+        """Write the map and the poses of its images."""
+        poses = self.trainer.poses.poses()
+        self.folder.save_map(self.trainer.model, Trajectory(np.arange(float(len(poses))), poses))
+
+    def score(
+        self, pictures: Pictures = lambda rows, scores: {}, report: Callable[[TrainingProgress], None] = lambda _: None
+    ) -> dict[str, Any]:
+        """Score all held-out views; write the scores and the pictures; return the scores."""
+        scores = score_held_out(
+            self.trainer.model,
+            self.held_out,
+            self.options,
+            self.trainer.extent,
+            shown=CONSTANTS.shown_views,
+            report=lambda done: report(self._progress(f"scoring {done + 1}/{len(self.held_out.views)}")),
+        )
+        model, result = self.trainer.model, summary(scores)
         rows = [*self.rows, self._row(result["psnr_db"])]
         result |= {
             "iterations": self.trainer.iteration,
@@ -171,9 +196,7 @@ class TrainingSession:
             "sh_degree": model.sh_degree,
             "complete": self.share >= 1.0,
         }
-        poses = self.trainer.poses.poses()
-        trajectory = Trajectory(np.arange(float(len(poses))), poses)
-        self.folder.save_results(model, trajectory, rows, result, pictures(rows, scores))
+        self.folder.save_scores(rows, result, pictures(rows, scores))
         return result
 
     def _some_psnr(self) -> float | None:
@@ -183,9 +206,8 @@ class TrainingSession:
             return None
         step = -(-len(views) // CONSTANTS.scored_views)
         some = self.held_out.chosen(range(0, len(views), step))
-        return fmean(
-            score.psnr_db for score in score_held_out(self.trainer.model, some, self.options, self.trainer.extent)
-        )
+        scores = score_held_out(self.trainer.model, some, self.options, self.trainer.extent, psnr_only=True)
+        return fmean(score.psnr_db for score in scores) if scores else None
 
     def _note(self, psnr_db: float | None) -> None:
         self.rows.append(self._row(psnr_db))

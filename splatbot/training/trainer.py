@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -70,7 +70,8 @@ class Trainer:
     """
 
     def __init__(self, model: GaussianModel, images: ImageCache, options: TrainingOptions, extent: float) -> None:
-        self.model = model.clone()
+        bands = (options.sh_degree + 1) ** 2
+        self.model = replace(model.clone(), sh=model.sh[:, :bands].clone())
         self.images = images
         self.options = options
         self.extent = extent
@@ -129,7 +130,8 @@ class Trainer:
     def _step(self, progress: float) -> float:
         index = self._next_view()
         photo = self.images.photo(index, _reduction(progress, self.options.coarse_share))
-        degree = min(self.options.sh_degree, int(progress / CONSTANTS.harmonics_share * (self.options.sh_degree + 1)))
+        scheduled = int(progress / CONSTANTS.harmonics_share * (self.options.sh_degree + 1))
+        degree = max(self.model.sh_degree, min(self.options.sh_degree, scheduled))
         self.model = grow_harmonics(self.model, self.adam, degree)
         self._set_rates(progress)
         parameters = {name: getattr(self.model, name).requires_grad_(True) for name in PARAMETERS}

@@ -21,6 +21,7 @@ import pytest
 from splatbot.errors import FormatError, InputError
 from splatbot.formats.ply import load_ply
 from splatbot.services.library import MapLibrary
+from splatbot.services.problems import SaveError
 from splatbot.services.scratch import Scratch, sweep_scratch
 from splatbot.services.settings import ServiceSettings
 from splatbot.services.store import MapStore, ServedMap
@@ -246,6 +247,24 @@ def test_a_defect_in_saving_one_map_does_not_end_the_saving_of_others(
         until(lambda: (tmp_path / "desk" / "v1").is_dir())
         service.store.publish("desk", wall(2))
         until(lambda: (tmp_path / "desk" / "v2").is_dir())
+
+
+def test_a_save_that_failed_after_its_state_was_renamed_is_made_up_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store, library = MapStore(), MapLibrary(tmp_path)
+    store.add("desk", source="log", state="mapping", workspace=Workspace(np.eye(4)), snapshot=wall(1))
+
+    def fail(folder: Path) -> None:
+        raise OSError(5, "Input/output error", str(folder))
+
+    monkeypatch.setattr("splatbot.services.library.sync_folder", fail)  # the last step of a save
+    with pytest.raises(SaveError, match="Input/output error"):
+        library.save(store.get("desk"))
+    assert (tmp_path / "desk" / "v1").is_dir()
+    monkeypatch.undo()
+    library.save(store.get("desk"))
+    assert load(tmp_path) == 1
 
 
 def test_an_idempotency_key_covers_the_uploaded_file() -> None:

@@ -29,7 +29,7 @@ class TrainingBenchSettings(Settings):
         splatbot bench training --quick
 
     Args:
-        dataset: A folder that `splatbot train` takes.
+        dataset: A COLMAP, Blender or Nerfstudio scene.
         minutes: Time of each training.
         knobs: Settings to vary, each around the default.
         scale: The images are reduced to 1/S of their size.

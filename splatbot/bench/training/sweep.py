@@ -17,10 +17,11 @@ from splatbot.bench.benchmark import ReportProgress
 from splatbot.bench.machine import describe_machine
 from splatbot.bench.results import Results
 from splatbot.bench.training import Knob, TrainingBenchSettings
+from splatbot.errors import InputError
 from splatbot.logs import open_log
 from splatbot.training.datasets import TrainingData, TrainingView, open_dataset
 from splatbot.training.folder import TrainingFolder, TrainingSettings
-from splatbot.training.options import TrainingOptions
+from splatbot.training.options import USUAL, TrainingOptions
 from splatbot.training.session import TrainingSession
 
 VALUES: dict[Knob, Sequence[Any]] = {
@@ -42,7 +43,8 @@ def run_sweep(settings: TrainingBenchSettings, report_progress: ReportProgress) 
     over the seconds of each case.
     """
     results = Results(describe_machine([1, os.cpu_count() or 1], peak_ms=settings.peak_ms))
-    usual = TrainingOptions(iterations=None, minutes=settings.minutes, seed=settings.seed)
+    data = _data(settings, settings.scale)
+    usual = TrainingOptions(iterations=None, minutes=settings.minutes, seed=settings.seed, **USUAL[data.kind])
     _add(results, "(default)", settings, usual, settings.scale, report_progress)
     for knob in settings.knobs:
         for value in VALUES[knob]:
@@ -64,12 +66,12 @@ def _add(
 ) -> None:
     report_progress(f"training {case}, {settings.minutes:g} min")
     data = _data(settings, scale)
-    options = replace(options, background="white" if data.kind == "blender" else "black")
     with TemporaryDirectory() as folder:
         session = TrainingSession(
             data, TrainingFolder(folder), TrainingSettings(data.folder, scale, 8, options), checkpoint_s=1e9
         )
-        scores = session.run()
+        session.run()
+        scores = session.score()
         rows = TrainingFolder(folder).load_progress()
     results.add(case, "PSNR", scores["psnr_db"], "dB")
     results.add(case, "SSIM", scores["ssim"], "")
@@ -81,7 +83,11 @@ def _add(
 
 def _data(settings: TrainingBenchSettings, scale: int) -> TrainingData:
     if settings.dataset is not None:
-        return open_dataset(settings.dataset, scale=scale)
+        data = open_dataset(settings.dataset, scale=scale)
+        if data.kind == "run":
+            hint = "give photographs; `splatbot train RUN` begins with the map of the run"
+            raise InputError("is the folder of a run.", file=settings.dataset, field="--dataset", hint=hint)
+        return data
     return simulated_data(_QUICK_LOG if settings.quick else _LOG, scale)
 
 

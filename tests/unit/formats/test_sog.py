@@ -211,9 +211,10 @@ def test_names_outside_of_the_folder_are_refused(tmp_path: Path, name: str) -> N
     folder = tmp_path / "map_sog"
     save_gaussians(detailed_model(20), folder)
     meta = json.loads((folder / "meta.json").read_text())
+    (tmp_path / "secret.webp").write_bytes((folder / "sh0.webp").read_bytes())  # a valid image outside
     meta["sh0"]["files"] = [name]
     (folder / "meta.json").write_text(json.dumps(meta))
-    with pytest.raises(FormatError) as caught:
+    with pytest.raises(FormatError, match="names") as caught:
         load_gaussians(folder)
     assert caught.value.hint
 

@@ -97,3 +97,10 @@ def test_zero_scales_and_zero_quaternions_are_replaced(tmp_path: Path, caplog: p
     assert model.scales[0, 0].item() == pytest.approx(1e-9, rel=1e-5)
     assert model.quats[1].tolist() == [1, 0, 0, 0]
     assert len(caplog.records) == 2
+
+
+@pytest.mark.parametrize("first", [b"{", b"PK", b"\x1f\x8b", b"ply", b"NGSP"])
+def test_a_first_float_that_looks_like_another_format_is_read_as_splat(first: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "map.splat"
+    path.write_bytes(first + (row() * 2)[len(first) :])
+    assert len(load_gaussians(path)) == 2
