@@ -18,7 +18,7 @@ from splatbot.results.folder import RunFolder
 from splatbot.run.state import SavedRun
 from splatbot.trajectory import Trajectory
 
-LOG = "synthetic:tabletop?width=160&height=120&frames=60"
+LOG = "synthetic:tabletop?width=160&height=120&frames=40"
 SMALL = [
     "--set",
     "mapping.refine_iterations=2",
