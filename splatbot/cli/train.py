@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from splatbot.training.session import TrainingProgress
 
 _DEFAULT_ITERATIONS = 7_000
+_OF_A_RUN = "training"  # folder of a training within its run
 
 
 def train(
@@ -66,7 +67,8 @@ def train(
 
     Args:
         dataset: folder of the photographs or of a run.
-        out: folder to write; by default runs/NAME-trained, and RUN/training for a run.
+        out: folder to write; by default runs/NAME-trained. The default for a run is RUN/training; with another folder,
+            the run keeps its map.
         minutes: time to train; the schedule follows the clock, so that two runs differ.
         iterations: steps to train, one photograph each; 7,000 unless minutes are given. Such runs repeat bit for bit.
         strategy: Default clones and splits Gaussians, absgrad by absolute gradients. Mcmc moves faint ones and grows to
@@ -116,7 +118,7 @@ def train(
             antialiased=antialiased,
             seed=seed,
         )
-        default = dataset / "training" if data.kind == "run" else Path("runs") / f"{dataset.resolve().name}-trained"
+        default = dataset / _OF_A_RUN if data.kind == "run" else Path("runs") / f"{dataset.resolve().name}-trained"
         folder = TrainingFolder(out or default)
         folder.check_free(overwrite=overwrite)
         settings = TrainingSettings(dataset.resolve(), scale, held_out_every, options)
@@ -138,7 +140,8 @@ def _train(
     from splatbot.run.interrupts import Interrupts
     from splatbot.training.session import TrainingSession
 
-    in_place = data.kind == "run" and settings.options.keeps_frame
+    its_own = data.kind == "run" and folder.path.resolve() == (data.folder / _OF_A_RUN).resolve()
+    in_place = its_own and settings.options.keeps_frame
     with Interrupts() as interrupts, _progress(quiet) as report:
         with interrupts.interruptible():
             start = GaussianModel.load(RunFolder(data.folder).map) if data.kind == "run" else None

@@ -37,6 +37,7 @@ _WORDS = {
     "render": ["render", "{run}", "--out", "{out}/a.png", "--size", "80x60"],
     "info": ["info", "{run}"],
     "info of a log": ["info", LOG],
+    "train": ["train", "{run}", "--iterations", "60", "--out", "{out}/trained"],
     "simulate": ["simulate", "tabletop", "--frames", "3", "--size", "80x60", "--out", "{out}/log"],
     "simulate --list": ["simulate", "--list"],
     "record": ["record", LOG, "--out", "{out}/a.mcap"],
