@@ -225,6 +225,6 @@ def _print(folder: TrainingFolder, map_: Path, scores: dict[str, Any]) -> None:
         ("PSNR", decibels(scores["psnr_db"])),
         ("SSIM", number(scores["ssim"], 3)),
         ("map", str(map_)),
-        ("pictures", "\n".join(str(path) for path in pictures if path.exists())),
+        *(("picture", str(path)) for path in pictures if path.exists()),
     ]
     print_table(rows, title=str(folder.path))
