@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from splatbot.training.session import TrainingProgress
 
 _DEFAULT_ITERATIONS = 7_000
+_WIDE_COLUMNS = 110  # of a terminal that shows all numbers
 _OF_A_RUN = "training"  # folder of a training within its run
 
 
@@ -103,6 +104,7 @@ def train(
         settings = folder.load_settings()
         if dataset is not None:  # it was moved
             settings = replace(settings, dataset=dataset.resolve())
+            folder.save_settings(settings)
         data = open_training_data(settings.dataset, settings.scale, log)
     else:
         assert dataset is not None
@@ -122,7 +124,7 @@ def train(
         folder = TrainingFolder(out or default)
         folder.check_free(overwrite=overwrite)
         settings = TrainingSettings(dataset.resolve(), scale, held_out_every, options)
-    return _train(data, folder, settings, checkpoint_every, resumed=resume is not None, quiet=quiet)
+    return _train(data, folder, settings, checkpoint_every, log, resumed=resume is not None, quiet=quiet)
 
 
 def _train(
@@ -130,6 +132,7 @@ def _train(
     folder: TrainingFolder,
     settings: TrainingSettings,
     checkpoint_every: float,
+    log: str | None,
     *,
     resumed: bool,
     quiet: bool,
@@ -156,7 +159,7 @@ def _train(
         with interrupts.interruptible(after=int(interrupts.requested is not None)):
             scores = session.score(training_pictures, report)
             if in_place:
-                _rescore(RunFolder(data.folder), data)
+                _rescore(RunFolder(data.folder), log)
     if not quiet:
         _print(folder, data.folder / MAP_NAME if in_place else folder.map, scores)
     if not scores["complete"]:
@@ -165,12 +168,12 @@ def _train(
     return 0
 
 
-def _rescore(run: RunFolder, data: TrainingData) -> None:
-    """Write the figures of the trained map into ``metrics.json`` of its run."""
+def _rescore(run: RunFolder, log: str | None) -> None:
+    """Write the figures of the trained map into ``metrics.json`` of its run; ``log`` is where the recording is now."""
     from splatbot.results.rescore import rescore
     from splatbot.robots.in_view import reopen_log
 
-    run.save_metrics(run.load_metrics() | rescore(run, reopen_log(run)))
+    run.save_metrics(run.load_metrics() | rescore(run, reopen_log(run, uri=log)))
 
 
 @contextmanager
@@ -189,7 +192,10 @@ def _progress(quiet: bool) -> Iterator[Callable[[TrainingProgress], None]]:
     with Progress(*columns, console=Console(stderr=True), transient=True) as bars:
         task = bars.add_task("reading", total=1.0, numbers="")
         yield lambda progress: bars.update(
-            task, description=progress.doing, completed=progress.share, numbers=_numbers(progress)
+            task,
+            description=progress.doing,
+            completed=progress.share,
+            numbers=_numbers(progress, wide=bars.console.width >= _WIDE_COLUMNS),
         )
 
 
@@ -205,11 +211,14 @@ class _PlainTraining:
             print(f"{progress.doing} {100 * progress.share:.0f} %  {_numbers(progress)}", file=sys.stderr, flush=True)
 
 
-def _numbers(progress: TrainingProgress) -> str:
+def _numbers(progress: TrainingProgress, *, wide: bool = True) -> str:
     row = progress.row
-    psnr = f"  PSNR {row.psnr_db:.2f} dB" if row.psnr_db is not None else ""
+    psnr = f"PSNR {row.psnr_db:.2f} dB" if row.psnr_db is not None else ""
     left = f"{int(progress.remaining_s) // 60}:{int(progress.remaining_s) % 60:02d} left" if progress.share > 0 else ""
-    return f"iteration {row.iteration:,}  loss {row.loss:.4f}{psnr}  {row.gaussians:,} Gaussians  {left}"
+    if not wide:
+        return "  ".join(filter(None, (f"loss {row.loss:.4f}", psnr, left)))
+    parts = (f"iteration {row.iteration:,}", f"loss {row.loss:.4f}", psnr, f"{row.gaussians:,} Gaussians", left)
+    return "  ".join(filter(None, parts))
 
 
 def _print(folder: TrainingFolder, map_: Path, scores: dict[str, Any]) -> None:

@@ -82,14 +82,15 @@ class TrainingFolder:
         try:
             self.path.mkdir(parents=True, exist_ok=True)
             self.checkpoint.unlink(missing_ok=True)
-            self._save_settings(settings)
+            self.save_settings(settings)
         except OSError as error:
             hint = "name another folder"
             raise InputError(
                 f"cannot be written ({error.strerror}).", file=self.path, field="--out", hint=hint
             ) from error
 
-    def _save_settings(self, settings: TrainingSettings) -> None:
+    def save_settings(self, settings: TrainingSettings) -> None:
+        """Write ``training.json``."""
         values = {"format": _FORMAT} | asdict(settings) | {"dataset": str(settings.dataset)}
         with atomic_write(self.settings) as file:
             file.write(json.dumps(values, indent=2).encode())
