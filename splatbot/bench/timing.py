@@ -9,9 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-import torch
-
-from splatbot.rasterize.native import native
+from splatbot.rasterize.native import native, one_torch_thread
 
 
 @dataclass(frozen=True)
@@ -45,14 +43,12 @@ def _milliseconds(function: Callable[[], object]) -> float:
 @contextmanager
 def threads(count: int) -> Iterator[None]:
     """Run the kernels on ``count`` threads, and torch on one: its threads spin and would starve the kernels'."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
     native().set_num_threads(count)
     try:
-        yield
+        with one_torch_thread():
+            yield
     finally:
         native().set_num_threads(0)
-        torch.set_num_threads(before)
 
 
 @contextmanager

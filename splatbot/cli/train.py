@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -148,10 +149,10 @@ def _train(
     with Interrupts() as interrupts, _progress(quiet) as report:
         with interrupts.interruptible():
             start = GaussianModel.load(RunFolder(data.folder).map) if data.kind == "run" else None
-            session = TrainingSession(data, folder, settings, start=start, checkpoint_s=checkpoint_every)
-            if resumed:
-                session.resume()
-            else:
+            session = TrainingSession(
+                data, folder, settings, start=start, checkpoint_s=checkpoint_every, resume=resumed
+            )
+            if not resumed:
                 folder.begin(settings)
         session.run(report=report, stop=lambda: interrupts.requested is not None)
         if in_place:
@@ -204,8 +205,6 @@ class _PlainTraining:
         self._due = 0.0
 
     def __call__(self, progress: TrainingProgress) -> None:
-        import time
-
         if time.monotonic() >= self._due:
             self._due = time.monotonic() + 10.0
             print(f"{progress.doing} {100 * progress.share:.0f} %  {_numbers(progress)}", file=sys.stderr, flush=True)

@@ -72,7 +72,8 @@ def load_glb(path: str | Path) -> GaussianModel:
             raise FormatError(f"has no primitive with {EXTENSION}.", file=path, field=EXTENSION, hint=hint)
         counts = [int(_accessor(path, document, primitive, "POSITION")["count"]) for _, primitive in placed]
         check_count(path, sum(counts), "POSITION")
-        check_expansion(path, 56 * sum(counts), len(data), "POSITION")
+        sizes = [_decoded_bytes(primitive) * count for (_, primitive), count in zip(placed, counts, strict=True)]
+        check_expansion(path, sum(sizes), len(data), "POSITION")
         models = [
             model_of(path, turn(_place(path, _read_splats(path, document, binary, primitive), T), LUF))
             for T, primitive in placed
@@ -278,6 +279,11 @@ def _log_scales(path: str | Path, scales: NDArray[np.float64]) -> NDArray[np.flo
         raise FormatError(f"row {int(np.argmax(negative))} is negative.", file=path, field="SCALE", hint=hint)
     with np.errstate(divide="ignore"):  # a scale of 0 becomes the least one
         return np.log(scales)
+
+
+def _decoded_bytes(primitive: Json) -> int:
+    """Return the bytes of a Gaussian in memory: 11 values, and 3 for each coefficient of the harmonics."""
+    return 4 * (11 + 3 * sum(name.startswith(f"{EXTENSION}:SH_DEGREE") for name in primitive["attributes"]))
 
 
 def _accessor(path: str | Path, document: Json, primitive: Json, name: str) -> Json:

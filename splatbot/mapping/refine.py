@@ -19,9 +19,10 @@ from splatbot.gaussians.shape import shortest_axes
 from splatbot.mapping.densify import PositionGradients
 from splatbot.mapping.keyframes import Keyframe
 from splatbot.optimize.adam import PARAMETERS, GaussianAdam
-from splatbot.optimize.losses import l1, l1_dssim
+from splatbot.optimize.losses import l1, l1_dssim, relative_depth_error
 from splatbot.optimize.surfaces import limit_normal_motion, limit_shape
 from splatbot.rasterize import rasterization
+from splatbot.rasterize.native import one_torch_thread
 
 Stop = Callable[[], bool]
 """Called before each iteration; refinement ends once it returns True."""
@@ -35,13 +36,11 @@ class RefineConstants:
         removed_depth_share: [share of depth] where a keyframe's depth is smaller than the map's by more, it shows an
             object that was removed since. Such pixels carry no loss.
         covered_alpha: pixels that the map covers less carry no loss.
-        least_depth: [m] smaller measured depths do not increase the weight of the depth loss further.
         latest_share: share of the random draws that come from the latest ``window`` keyframes.
     """
 
     removed_depth_share: float = 0.1
     covered_alpha: float = 0.5
-    least_depth: float = 0.1
     latest_share: float = 0.5
 
 
@@ -115,16 +114,9 @@ class Refiner:
     def step(
         self, model: GaussianModel, keyframe: Keyframe, position_gradients: PositionGradients | None = None
     ) -> float:
-        """Run one iteration on one keyframe and return the loss before it; an error leaves model and optimizer as is.
-
-        PyTorch uses one thread meanwhile: its threads spin after each operation, which starves the rasterizer's.
-        """
-        threads = torch.get_num_threads()
-        torch.set_num_threads(1)
-        try:
+        """Run one iteration on one keyframe; return the loss before it. An error leaves map and optimizer as they are."""
+        with one_torch_thread():
             return self._step(model, keyframe, position_gradients)
-        finally:
-            torch.set_num_threads(threads)
 
     def _draw(self, keyframes: Sequence[Keyframe]) -> Keyframe:
         latest = self._random.random() < CONSTANTS.latest_share
@@ -197,8 +189,7 @@ class Refiner:
         color = self._color_loss(render[..., :3], observed, covered)
         depth = keyframe.depth[..., None]
         measured = (depth > 0) & covered[..., None]
-        scale = depth.clamp_min(CONSTANTS.least_depth)
-        return color + self.config.depth_weight * l1(render[..., 3:] / scale, depth / scale, measured)
+        return color + self.config.depth_weight * relative_depth_error(render[..., 3:], depth, measured)
 
     def _color_loss(self, rendered: Tensor, observed: Tensor, covered: Tensor) -> Tensor:
         if self.config.dssim_weight > 0:

@@ -12,6 +12,7 @@ from splatbot.rasterize.native import native
 
 Padding = Literal["same", "valid"]
 
+_LEAST_DEPTH = 0.1  # [m]
 WINDOW = 11  # [px] side of the window of SSIM
 
 
@@ -21,6 +22,15 @@ def l1(rendered: Tensor, observed: Tensor, mask: Tensor | None = None) -> Tensor
     if mask is None:
         return difference.mean()
     return (difference * mask).sum() / mask.expand_as(difference).sum().clamp_min(1)
+
+
+def relative_depth_error(rendered: Tensor, depth: Tensor, mask: Tensor) -> Tensor:
+    """Return the mean |(D - D*) / D*| of rendered depth D against measured depth D*, over ``mask``; all (H, W, 1) [m].
+
+    Depth below 0.1 m counts as 0.1 m in the divisor.
+    """
+    scale = depth.clamp_min(_LEAST_DEPTH)
+    return l1(rendered / scale, depth / scale, mask)
 
 
 def l1_dssim(

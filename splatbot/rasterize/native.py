@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import functools
 import importlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import ModuleType
+
+import torch
 
 from splatbot.errors import NativeError
 
@@ -39,3 +43,14 @@ def native() -> ModuleType:
             f"{error}.", file="splatbot._native", hint="check SPLATBOT_ISA and SPLATBOT_NUM_THREADS"
         ) from error
     return module
+
+
+@contextmanager
+def one_torch_thread() -> Iterator[None]:
+    """Return a context in which PyTorch uses one thread: its threads spin after an operation, and starve the core's."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)

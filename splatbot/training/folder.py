@@ -6,18 +6,18 @@ import io
 import json
 import pickle
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from splatbot.atomic import atomic_write, replace_files, write_bytes, write_text
-from splatbot.checksums import check_file
 from splatbot.errors import FormatError, InputError
 from splatbot.formats.ply import save_ply
 from splatbot.gaussians import GaussianModel
 from splatbot.layouts import MAP_NAME, TRAINING_NAME
+from splatbot.results.metrics import without_nan
 from splatbot.training.options import TrainingOptions
 from splatbot.trajectory import Trajectory
 
@@ -107,8 +107,7 @@ class TrainingFolder:
                 raise FormatError(
                     f"is {values['format']!r}.", file=self.settings, field="format", hint="use a matching version"
                 )
-            known = {field.name for field in fields(TrainingOptions)}
-            options = TrainingOptions(**{k: v for k, v in values["options"].items() if k in known})
+            options = TrainingOptions(**values["options"])
             return TrainingSettings(
                 Path(values["dataset"]), int(values["scale"]), int(values["held_out_every"]), options
             )
@@ -155,26 +154,12 @@ class TrainingFolder:
         self, rows: Sequence[ProgressRow], scores: Mapping[str, Any], pictures: Mapping[str, bytes]
     ) -> None:
         """Write the course of the training, the scores, and pictures by name."""
-        lines = "".join(json.dumps(asdict(row), allow_nan=False) + "\n" for row in rows)
+        lines = "".join(json.dumps(without_nan(asdict(row)), allow_nan=False) + "\n" for row in rows)
         writers = {
             self.progress.name: write_text(lines),
             self.scores.name: write_text(json.dumps(dict(scores), indent=2, allow_nan=False)),
         }
         replace_files(self.path, writers | {name: write_bytes(data) for name, data in pictures.items()})
-
-    def load_progress(self) -> list[ProgressRow]:
-        """Read the course of the training; empty without the file.
-
-        Raises:
-            FormatError: the file is damaged.
-        """
-        check_file(self.progress)
-        if not self.progress.is_file():
-            return []
-        try:
-            return [ProgressRow(**json.loads(line)) for line in self.progress.read_text().splitlines()]
-        except (ValueError, TypeError) as error:
-            raise FormatError(f"is damaged ({error}).", file=self.progress, hint="remove the file") from error
 
     def check_free(self, *, overwrite: bool) -> None:
         """Check that the folder holds no run, and no other training unless that may be replaced.

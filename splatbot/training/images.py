@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -16,6 +15,7 @@ from torch import Tensor
 from splatbot.camera import Camera
 from splatbot.errors import InputError
 from splatbot.training.datasets import TrainingData, TrainingView
+from splatbot.training.datasets.images import resample, scaled, scaled_depth, scaled_mask
 
 _LEAST_SIDE = 96  # [px] smaller images are not reduced further
 
@@ -52,15 +52,6 @@ class ImageCache:
         self.views = tuple(views)
         self._kept: dict[tuple[int, int], tuple[NDArray[np.uint8], NDArray[np.bool_] | None, Tensor | None]] = {}
 
-    def chosen(self, indices: Iterable[int]) -> ImageCache:
-        """Return a cache of some of the views, with their decoded images."""
-        indices = list(indices)
-        part = ImageCache([self.views[i] for i in indices])
-        for (index, reduce), kept in self._kept.items():
-            if index in indices:
-                part._kept[indices.index(index), reduce] = kept
-        return part
-
     def photo(self, index: int, reduce: int = 1) -> Photo:
         """Return view ``index`` at 1/``reduce`` of its size.
 
@@ -87,13 +78,9 @@ class ImageCache:
         self.photo(index)
         image, left_out, depth = self._kept[index, 1]
         size = image.shape[1] // reduce, image.shape[0] // reduce
-        small = np.asarray(cv2.resize(_premultiplied(image), size, interpolation=cv2.INTER_AREA), dtype=np.float32)
-        if left_out is not None:
-            touched = cv2.resize(left_out.astype(np.float32), size, interpolation=cv2.INTER_AREA)
-            left_out = np.asarray(touched) > 0
-        if depth is not None:  # an average across an edge is the depth of no surface
-            depth = torch.from_numpy(cv2.resize(depth.numpy(), size, interpolation=cv2.INTER_NEAREST))
-        return _straight(small), left_out, depth
+        small = resample(image, lambda pixels: scaled(pixels, size))
+        mask = None if left_out is None else scaled_mask(left_out, size)
+        return small, mask, None if depth is None else torch.from_numpy(scaled_depth(depth.numpy(), size))
 
 
 def check_memory(data: TrainingData) -> None:
@@ -119,16 +106,3 @@ def _free_memory() -> float | None:
     except OSError:
         return None
     return next((1024.0 * float(line.split()[1]) for line in lines if line.startswith("MemAvailable:")), None)
-
-
-def _premultiplied(image: NDArray[np.uint8]) -> NDArray[np.float32]:
-    values = image.astype(np.float32)
-    if image.shape[2] == 4:
-        values[..., :3] *= values[..., 3:] / 255
-    return values
-
-
-def _straight(image: NDArray[np.float32]) -> NDArray[np.uint8]:
-    if image.shape[2] == 4:
-        image[..., :3] /= np.maximum(image[..., 3:] / 255, 1 / 255)
-    return np.clip(np.rint(image), 0, 255).astype(np.uint8)

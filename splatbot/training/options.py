@@ -6,12 +6,21 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+import torch
+from torch import Tensor
+
+from splatbot.config import MappingConfig
 from splatbot.errors import InputError
-from splatbot.optimize.strategies import DefaultStrategy, FixedStrategy, MCMCStrategy, Strategy
+from splatbot.optimize.strategies import DefaultStrategy, MCMCStrategy, Strategy
 from splatbot.training.datasets.base import DatasetKind
 
 USUAL: Mapping[DatasetKind, Mapping[str, Any]] = {
-    "run": {"strategy": "fixed", "depth_weight": 4.0, "keep_surfaces": True, "coarse_share": 0.0},
+    "run": {
+        "strategy": "fixed",
+        "depth_weight": MappingConfig().depth_weight,
+        "keep_surfaces": True,
+        "coarse_share": 0.0,
+    },
     "blender": {"strategy": "default", "background": "white"},
     "colmap": {"strategy": "mcmc"},
     "nerfstudio": {"strategy": "mcmc"},
@@ -95,6 +104,11 @@ class TrainingOptions:
         return usual if opacity is None else opacity, usual if scale is None else scale
 
     @property
+    def shade(self) -> Tensor:
+        """The colour (3,) behind images with alpha; black where training draws it at random."""
+        return torch.full((3,), float(self.background == "white"))
+
+    @property
     def keeps_frame(self) -> bool:
         """Return whether the trained map keeps surfaces and world frame of the start, so that it can replace it."""
         return self.keep_surfaces and self.strategy == "fixed" and not self.refine_poses
@@ -108,7 +122,7 @@ class TrainingOptions:
     def make_strategy(self) -> Strategy:
         """Return the strategy with its cap."""
         if self.strategy == "fixed":
-            return FixedStrategy()
+            return Strategy()
         cap = self.max_gaussians or _MOST_GAUSSIANS
         if self.strategy == "mcmc":
             return MCMCStrategy(cap_max=cap)

@@ -48,6 +48,7 @@ def score_held_out(
     options: TrainingOptions,
     extent: float,
     *,
+    every: int = 1,
     psnr_only: bool = False,
     shown: int = 0,
     report: Callable[[int], None] = lambda done: None,
@@ -62,17 +63,17 @@ def score_held_out(
         images: the held-out views.
         options: of the training.
         extent: of the scene [m].
+        every: score each such view only.
         psnr_only: leave SSIM out.
         shown: number of views, evenly spaced, whose images are kept.
         report: receives the number of views done.
     """
     if not images.views:
         return []
-    background = torch.full((3,), 1.0 if options.background == "white" else 0.0)
-    poses = CameraPoses([view.T_world_camera for view in images.views], extent)
+    background, poses = options.shade, CameraPoses([view.T_world_camera for view in images.views], extent)
     kept = set(np.linspace(0, len(images.views) - 1, min(shown, len(images.views))).round().astype(int).tolist())
     scores = []
-    for index, view in enumerate(images.views):
+    for index in range(0, len(images.views), every):
         report(index)
         photo = images.photo(index)
         if photo.trained is not None and not photo.trained.any():
@@ -87,7 +88,7 @@ def score_held_out(
         counted = slice(None) if photo.trained is None else photo.trained
         scores.append(
             HeldOutScore(
-                view.name,
+                images.views[index].name,
                 psnr(render[counted].numpy(), image[counted].numpy()),
                 None if psnr_only else _ssim(render, image, photo),
                 (255 * torch.stack([image, render])).round().to(torch.uint8).numpy() if index in kept else None,

@@ -68,9 +68,14 @@ class TrainingSession:
     Args:
         data: the dataset.
         folder: where the results and checkpoints go.
-        settings: of the run; already saved in the folder.
+        settings: of the run.
         start: the Gaussians of the start; None for the points of the dataset, or random ones.
         checkpoint_s: time between two checkpoints [s].
+        resume: continue from the checkpoint of the folder; without one, the training begins again.
+
+    Raises:
+        FormatError: the checkpoint is damaged.
+        InputError: the images do not fit into memory, or are not those of the checkpoint.
     """
 
     def __init__(
@@ -81,14 +86,21 @@ class TrainingSession:
         *,
         start: GaussianModel | None = None,
         checkpoint_s: float = 60.0,
+        resume: bool = False,
     ) -> None:
-        self.data, self.folder = data, folder
+        self.folder = folder
         train, held_out = data.split(settings.held_out_every)
         check_memory(data)
         pixels = sum(view.camera.width * view.camera.height for view in train)
         self.options: TrainingOptions = settings.options.capped(pixels)
         self.images, self.held_out = ImageCache(train), ImageCache(held_out)
-        if start is None:
+        saved = folder.load_checkpoint() if resume and folder.checkpoint.exists() else None
+        if saved is not None:
+            if saved["views"] != self._views():
+                hint = "restore the images, or train again (--overwrite)"
+                raise InputError("has other images than at the start.", file=data.folder, field="--resume", hint=hint)
+            start = GaussianModel(**saved["trainer"]["model"])
+        elif start is None:
             assert self.options.max_gaussians is not None
             start = initial_model(data, self.images, most=self.options.max_gaussians, seed=self.options.seed)
         self.trainer = Trainer(start, self.images, self.options, data.scene_extent)
@@ -96,24 +108,10 @@ class TrainingSession:
         self.rows: list[ProgressRow] = []
         self._checkpoint_s = checkpoint_s
         self._losses: list[float] = []
-
-    def resume(self) -> None:
-        """Load the checkpoint of the folder; without one, the training begins again.
-
-        Raises:
-            FormatError: it is damaged.
-            InputError: the images are not those that the training began with.
-        """
-        if not self.folder.checkpoint.exists():
-            return
-        state = self.folder.load_checkpoint()
-        if state["views"] != self._views():
-            hint = "restore the images, or train again (--overwrite)"
-            raise InputError("has other images than at the start.", file=self.data.folder, field="--resume", hint=hint)
-        self.trainer.restore(state["trainer"])
-        self.seconds = state["seconds"]
-        self.rows = [ProgressRow(**row) for row in state["rows"]]
-        self._losses = state["losses"]
+        if saved is not None:
+            self.trainer.restore(saved["trainer"])
+            self.seconds, self._losses = saved["seconds"], saved["losses"]
+            self.rows = [ProgressRow(**row) for row in saved["rows"]]
 
     def _views(self) -> list[str]:
         """Return name and size of each training view."""
@@ -204,9 +202,14 @@ class TrainingSession:
         views = self.held_out.views
         if not views or self.options.refine_poses:
             return None
-        step = -(-len(views) // CONSTANTS.scored_views)
-        some = self.held_out.chosen(range(0, len(views), step))
-        scores = score_held_out(self.trainer.model, some, self.options, self.trainer.extent, psnr_only=True)
+        scores = score_held_out(
+            self.trainer.model,
+            self.held_out,
+            self.options,
+            self.trainer.extent,
+            every=-(-len(views) // CONSTANTS.scored_views),
+            psnr_only=True,
+        )
         return fmean(score.psnr_db for score in scores) if scores else None
 
     def _note(self, psnr_db: float | None) -> None:

@@ -10,19 +10,22 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from splatbot.config import MappingConfig
 from splatbot.gaussians import GaussianModel
 from splatbot.gaussians.shape import shortest_axes
 from splatbot.optimize.adam import PARAMETERS, GaussianAdam
-from splatbot.optimize.losses import l1, l1_dssim
+from splatbot.optimize.losses import l1_dssim, relative_depth_error
+from splatbot.optimize.strategies import StrategyStep
 from splatbot.optimize.strategies.edits import grow_harmonics
 from splatbot.optimize.surfaces import limit_normal_motion, limit_shape
 from splatbot.rasterize import rasterization
 from splatbot.rasterize.meta import RenderMeta
+from splatbot.rasterize.native import one_torch_thread
 from splatbot.training.images import ImageCache, Photo
 from splatbot.training.options import TrainingOptions
 from splatbot.training.poses import CameraPoses
 
-_BACKGROUNDS = {"black": 0.0, "white": 1.0}
+_MAPPING = MappingConfig()
 
 
 @dataclass(frozen=True)
@@ -36,9 +39,6 @@ class TrainerConstants:
         pose_rate: at the start and at the end [rad]; exponential in between.
         harmonics_share: share of the run after which the harmonics have their final degree.
         covered_alpha: depth counts where the map covers a pixel more.
-        least_depth: [m] smaller depth does not increase the weight of its error further.
-        normal_step_scale, max_pixels, thickness: with ``keep_surfaces``, as in the section ``mapping`` of the
-            configuration.
     """
 
     means_rate: tuple[float, float] = (1.6e-4, 1.6e-6)
@@ -50,10 +50,6 @@ class TrainerConstants:
     pose_rate: tuple[float, float] = (2e-3, 2e-5)
     harmonics_share: float = 0.4
     covered_alpha: float = 0.5
-    least_depth: float = 0.1
-    normal_step_scale: float = 0.3
-    max_pixels: float = 6.0
-    thickness: float = 0.2
 
 
 CONSTANTS = TrainerConstants()
@@ -89,7 +85,7 @@ class Trainer:
         steps, first, second = self.adam.state()
         return {
             "iteration": self.iteration,
-            "model": {name: getattr(self.model, name) for name in _MODEL},
+            "model": dict(vars(self.model)),
             "adam": {"steps": steps, "first": first, "second": second, "skipped": self.adam.skipped},
             "strategy": dict(self._growth),
             "poses": {name: getattr(self.poses, name) for name in ("viewmats", "first", "second", "steps")},
@@ -113,17 +109,11 @@ class Trainer:
     def step(self, progress: float) -> float:
         """Run one iteration and return its loss.
 
-        PyTorch uses one thread meanwhile: its threads spin after each operation, which starves the rasterizer's.
-
         Args:
             progress: share of the run that is done, 0 to 1: rates, resolution and degree follow it.
         """
-        threads = torch.get_num_threads()
-        torch.set_num_threads(1)
-        try:
+        with one_torch_thread():
             loss = self._step(progress)
-        finally:
-            torch.set_num_threads(threads)
         self.iteration += 1
         return loss
 
@@ -158,22 +148,21 @@ class Trainer:
         self._add_regularizers(grads)
         with self._surfaces_kept(index, photo, meta["visible_ids"][0]):
             self.adam.step(self.model, grads, meta["visibility"][0])
-        self.model = self.strategy.step_post_backward(
-            self.model, self.adam, self._growth, self.iteration, meta, progress=progress, random=self._random
-        )
+        done = StrategyStep(self.iteration, progress, meta, self.adam, self._random)
+        self.model = self.strategy.step_post_backward(self.model, self._growth, done)
         return float(loss.detach())
 
     @contextmanager
     def _surfaces_kept(self, index: int, photo: Photo, rows: Tensor) -> Iterator[None]:
-        """Return a context that limits the step in its block if surfaces are to be kept."""
+        """Return a context that limits the step in its block as mapping does, if surfaces are to be kept."""
         if not self.options.keep_surfaces:
             yield
             return
         means, normals = self.model.means.index_select(0, rows), shortest_axes(self.model, rows)
         yield
-        limit_normal_motion(self.model, rows, means, normals, CONSTANTS.normal_step_scale)
+        limit_normal_motion(self.model, rows, means, normals, _MAPPING.normal_step_scale)
         viewmat, focal = self.poses.viewmats[index], photo.camera.fx
-        limits = {"max_pixels": CONSTANTS.max_pixels, "thickness": CONSTANTS.thickness}
+        limits = {"max_pixels": _MAPPING.max_pixels, "thickness": _MAPPING.thickness}
         limit_shape(self.model, rows, viewmat, focal, **limits)
 
     def _next_view(self) -> int:
@@ -185,19 +174,19 @@ class Trainer:
 
     def _set_rates(self, progress: float) -> None:
         c = CONSTANTS
-        rest = [c.dc_rate * c.rest_share] * (self.model.sh[0].numel() - 3) if len(self.model) else []
+        rest = [c.dc_rate * c.rest_share] * 3 * (self.model.sh.shape[1] - 1)
         self.adam.rates = {
             "means": _between(c.means_rate, progress) * self.extent,
             "quats": c.quats_rate,
             "log_scales": c.scales_rate,
             "opacity_logits": c.opacities_rate,
-            "sh": [c.dc_rate] * 3 + rest if rest else c.dc_rate,
+            "sh": [c.dc_rate] * 3 + rest,
         }
 
     def _background(self) -> Tensor:
         if self.options.background == "random":
             return torch.rand(3, generator=self._random)
-        return torch.full((3,), _BACKGROUNDS[self.options.background])
+        return self.options.shade
 
     def _loss(self, render: Tensor, alpha: Tensor, photo: Photo, background: Tensor) -> Tensor:
         """Compute L = (1 - λ) L1 + λ (1 - SSIM) + w_d mean |(D - D*) / D*|, over the pixels that are trained on."""
@@ -208,8 +197,7 @@ class Trainer:
         measured = (depth > 0) & (alpha.detach() > CONSTANTS.covered_alpha)
         if photo.trained is not None:
             measured &= photo.trained[..., None]
-        scale = depth.clamp_min(CONSTANTS.least_depth)
-        return loss + self.options.depth_weight * l1(render[..., 3:] / scale, depth / scale, measured)
+        return loss + self.options.depth_weight * relative_depth_error(render[..., 3:], depth, measured)
 
     def _add_regularizers(self, grads: dict[str, Tensor]) -> None:
         """Add the gradients of w_o · mean o + w_s · mean σ."""
@@ -220,9 +208,6 @@ class Trainer:
             grads["opacity_logits"] += opacity / n * o * (1 - o)
         if scale > 0:
             grads["log_scales"] += scale / (3 * n) * self.model.scales
-
-
-_MODEL = ("means", "quats", "log_scales", "opacity_logits", "sh", "observations", "anchors", "uncertainty", "misses")
 
 
 def render_photo(

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import TypeVar
 
-import torch
-
 from splatbot.bench.benchmark import ReportProgress
+from splatbot.rasterize.native import one_torch_thread
 
 _T = TypeVar("_T")
 
@@ -24,12 +23,8 @@ def over_scenes(
         report_progress: receives a line before each scene.
     """
     rows: list[_T] = []
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
+    with one_torch_thread():
         for seed in seeds:
             report_progress(f"scene {seed}, {len(rows)} {what} so far")
             rows += measure(seed)
-    finally:
-        torch.set_num_threads(threads)
     return rows

@@ -72,12 +72,12 @@ def _add(
         )
         session.run()
         scores = session.score()
-        rows = TrainingFolder(folder).load_progress()
     results.add(case, "PSNR", scores["psnr_db"], "dB")
     results.add(case, "SSIM", scores["ssim"], "")
     results.add(case, "Gaussians", scores["gaussians"], "")
     results.add(case, "iterations/s", scores["iterations"] / scores["seconds"], "1/s")
-    results.curves[case] = [(row.seconds, row.psnr_db) for row in rows if row.psnr_db is not None]
+    course = [(row.seconds, row.psnr_db) for row in session.rows if row.psnr_db is not None]
+    results.curves[case] = [*course, (session.seconds, scores["psnr_db"])]
     settings.save(results)
 
 

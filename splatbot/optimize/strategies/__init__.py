@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from splatbot.optimize.strategies.base import Strategy
+from splatbot.optimize.strategies.base import Strategy, StrategyStep
 from splatbot.optimize.strategies.default import DefaultStrategy
-from splatbot.optimize.strategies.fixed import FixedStrategy
 from splatbot.optimize.strategies.mcmc import MCMCStrategy
 
-__all__ = ["DefaultStrategy", "FixedStrategy", "MCMCStrategy", "Strategy"]
+__all__ = ["DefaultStrategy", "MCMCStrategy", "Strategy", "StrategyStep"]

@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 
 from splatbot.gaussians import GaussianModel
-from splatbot.optimize.adam import GaussianAdam
+from splatbot.optimize.strategies.base import Strategy, StrategyStep
 from splatbot.optimize.strategies.edits import duplicate, remove, reset_opacities, split
 from splatbot.rasterize.meta import RenderMeta
 
 
 @dataclass(frozen=True)
-class DefaultStrategy:
+class DefaultStrategy(Strategy):
     """Clones and splits Gaussians whose projected centres have large gradients (Kerbl et al. 2023, Sec. 5.2).
 
     Field names and defaults are gsplat's, but the stop is a share of the run, so that a budget of time can end it.
@@ -58,28 +58,18 @@ class DefaultStrategy:
         meta["means2d"].retain_grad()
 
     @torch.no_grad()
-    def step_post_backward(
-        self,
-        model: GaussianModel,
-        adam: GaussianAdam,
-        state: dict[str, Any],
-        step: int,
-        meta: RenderMeta,
-        *,
-        progress: float,
-        random: torch.Generator,
-    ) -> GaussianModel:
+    def step_post_backward(self, model: GaussianModel, state: dict[str, Any], step: StrategyStep) -> GaussianModel:
         """Return the model after clones, splits, removals and resets; see :class:`Strategy`."""
-        if progress >= self.refine_stop:
+        if step.progress >= self.refine_stop:
             return model
-        self._count(state, meta)
-        paused = step % self.reset_every < self.pause_refine_after_reset
-        if step > self.refine_start_iter and step % self.refine_every == 0 and not paused:
-            model = self._grow(model, adam, state, random)
-            model = self._prune(model, adam, state, step)
+        self._count(state, step.meta)
+        paused = step.number % self.reset_every < self.pause_refine_after_reset
+        if step.number > self.refine_start_iter and step.number % self.refine_every == 0 and not paused:
+            model = self._grow(model, state, step)
+            model = self._prune(model, state, step)
             state |= self.initialize_state(model, state["scene_scale"])
-        if step > 0 and step % self.reset_every == 0:
-            model = reset_opacities(model, adam, 2 * self.prune_opa)
+        if step.number > 0 and step.number % self.reset_every == 0:
+            model = reset_opacities(model, step.adam, 2 * self.prune_opa)
         return model
 
     def _count(self, state: dict[str, Any], meta: RenderMeta) -> None:
@@ -91,22 +81,20 @@ class DefaultStrategy:
         state["grad2d"].index_add_(0, ids, (gradient * half).norm(dim=-1).nan_to_num(0.0, 0.0, 0.0))
         state["count"].index_add_(0, ids, torch.ones(len(ids)))
 
-    def _grow(
-        self, model: GaussianModel, adam: GaussianAdam, state: dict[str, Any], random: torch.Generator
-    ) -> GaussianModel:
+    def _grow(self, model: GaussianModel, state: dict[str, Any], step: StrategyStep) -> GaussianModel:
         gradient = state["grad2d"] / state["count"].clamp_min(1)
         coarse = _largest(gradient, self.grow_grad2d, self.cap_max - len(model))
         small = model.scales.amax(1) <= self.grow_scale3d * state["scene_scale"]
         cloned, halved = coarse & small, coarse & ~small
-        model = duplicate(model, adam, cloned)
+        model = duplicate(model, step.adam, cloned)
         halved = torch.cat([halved, torch.zeros(int(cloned.sum()), dtype=torch.bool)])
-        return split(model, adam, halved, random=random, revised_opacity=self.revised_opacity)
+        return split(model, step.adam, halved, random=step.random, revised_opacity=self.revised_opacity)
 
-    def _prune(self, model: GaussianModel, adam: GaussianAdam, state: dict[str, Any], step: int) -> GaussianModel:
+    def _prune(self, model: GaussianModel, state: dict[str, Any], step: StrategyStep) -> GaussianModel:
         useless = model.opacities < self.prune_opa
-        if step > self.reset_every:
+        if step.number > self.reset_every:
             useless |= model.scales.amax(1) > self.prune_scale3d * state["scene_scale"]
-        return remove(model, adam, useless)
+        return remove(model, step.adam, useless)
 
 
 def _largest(values: Tensor, limit: float, most: int) -> Tensor:

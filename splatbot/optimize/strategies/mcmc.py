@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 
 from splatbot.gaussians import GaussianModel
-from splatbot.optimize.adam import GaussianAdam
+from splatbot.optimize.strategies.base import Strategy, StrategyStep
 from splatbot.optimize.strategies.edits import inject_noise, relocate, sample_add
-from splatbot.rasterize.meta import RenderMeta
 
 
 @dataclass(frozen=True)
-class MCMCStrategy:
+class MCMCStrategy(Strategy):
     """Moves faint Gaussians to where opaque ones are, and grows up to a cap (Kheradmand et al. 2024).
 
     Field names and defaults are gsplat's, but the stop is a share of the run, so that a budget of time can end it. The
@@ -36,29 +35,12 @@ class MCMCStrategy:
     refine_every: int = 100
     min_opacity: float = 0.005
 
-    absgrad: ClassVar[bool] = False
-
-    def initialize_state(self, model: GaussianModel, scene_scale: float) -> dict[str, Any]:
-        """Return an empty state."""
-        return {}
-
-    def step_pre_backward(self, state: dict[str, Any], meta: RenderMeta) -> None:
-        """Keep nothing of the render."""
-
     @torch.no_grad()
-    def step_post_backward(
-        self,
-        model: GaussianModel,
-        adam: GaussianAdam,
-        state: dict[str, Any],
-        step: int,
-        meta: RenderMeta,
-        *,
-        progress: float,
-        random: torch.Generator,
-    ) -> GaussianModel:
+    def step_post_backward(self, model: GaussianModel, state: dict[str, Any], step: StrategyStep) -> GaussianModel:
         """Return the model after relocations, growth by 5 %, and noise; see :class:`Strategy`."""
-        if progress < self.refine_stop and step > self.refine_start_iter and step % self.refine_every == 0:
+        adam, random = step.adam, step.random
+        changes = step.number > self.refine_start_iter and step.number % self.refine_every == 0
+        if changes and step.progress < self.refine_stop:
             dead = model.opacities <= self.min_opacity
             model = relocate(model, adam, dead, least_opacity=self.min_opacity, random=random)
             new = max(0, min(self.cap_max, int(1.05 * len(model))) - len(model))

@@ -119,7 +119,7 @@ class PhotoFile:
         _check_size(self.file, (image.shape[1], image.shape[0]), self.lens)
         if not self.lens.distorts and self.size == (image.shape[1], image.shape[0]):
             return image
-        return _resample(image, self._undistorted_and_scaled)
+        return resample(image, self._undistorted_and_scaled)
 
     def read_mask(self) -> NDArray[np.bool_]:
         """Return the mask (H, W) of pixels that the photograph does not show."""
@@ -195,6 +195,11 @@ def scaled(image: Pixels, size: tuple[int, int]) -> Pixels:
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
 
 
+def scaled_depth(depth: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
+    """Scale a depth image to width and height [px]; keeps nearest pixels, since means across edges are no surface."""
+    return np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT))
+
+
 def scaled_mask(mask: NDArray[np.bool_], size: tuple[int, int]) -> NDArray[np.bool_]:
     """Scale a mask to width and height [px]; a pixel is True if any part of its area was."""
     return np.asarray(scaled(mask.astype(np.float32), size) > 0)
@@ -241,7 +246,7 @@ def _distorted_radius(lens: Lens, r: NDArray[np.float64]) -> NDArray[np.float64]
     return np.asarray(r * np.polyval([k3, k2, k1, 1.0], r**2) / np.polyval([k6, k5, k4, 1.0], r**2))
 
 
-def _resample(image: Image, resampler: Callable[[Pixels], Pixels]) -> Image:
+def resample(image: Image, resampler: Callable[[Pixels], Pixels]) -> Image:
     """Apply a linear resampler; colours with alpha are weighted by it, so hidden colours do not blend in."""
     if image.shape[2] == 3:
         return np.asarray(resampler(image), dtype=np.uint8)

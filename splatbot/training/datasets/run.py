@@ -6,7 +6,6 @@ from collections.abc import Callable
 from functools import lru_cache, partial
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,7 +15,7 @@ from splatbot.logs import Log, open_log
 from splatbot.results.folder import RunFolder
 from splatbot.results.views import rectified_log
 from splatbot.training.datasets.base import TrainingData, TrainingView
-from splatbot.training.datasets.images import Lens, scaled, scaled_mask, scaled_size, unseen
+from splatbot.training.datasets.images import Lens, scaled, scaled_depth, scaled_mask, scaled_size, unseen
 
 
 def run_dataset(folder: Path, log: Log, scale: int = 1) -> TrainingData:
@@ -93,10 +92,10 @@ class RunFrames:
         return np.asarray(scaled(self._read(index).rgb, self._size), dtype=np.uint8)
 
     def depth(self, index: int) -> NDArray[np.float32]:
-        """Read depth (H, W) [m] of a frame, 0 where masked; scaling keeps nearest pixels, not means across edges."""
+        """Read depth (H, W) [m] of a frame, 0 where masked."""
         frame = self._read(index)
         depth = np.where(frame.valid, frame.depth, np.float32(0))
-        return np.asarray(cv2.resize(depth, self._size, interpolation=cv2.INTER_NEAREST_EXACT))
+        return scaled_depth(depth, self._size)
 
     def mask(self, index: int) -> NDArray[np.bool_]:
         """Read the mask (H, W) of a frame, True where it is masked or the recorded image had no pixel."""

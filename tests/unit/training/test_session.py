@@ -22,12 +22,15 @@ from splatbot.training.session import TrainingSession
 from tests.unit.training.rendered import CAMERA, rendered_data, true_model
 
 
-def session_of(folder: Path, data: TrainingData, *, every: int = 8, **options: Any) -> TrainingSession:
+def session_of(
+    folder: Path, data: TrainingData, *, every: int = 8, resume: bool = False, **options: Any
+) -> TrainingSession:
     given: dict[str, Any] = {"iterations": 30, "background": "white", "strategy": "default"} | options
     settings = TrainingSettings(data.folder, 1, every, TrainingOptions(**given))
     place = TrainingFolder(folder)
-    place.begin(settings)
-    return TrainingSession(data, place, settings)
+    if not resume:
+        place.begin(settings)
+    return TrainingSession(data, place, settings, resume=resume)
 
 
 @pytest.fixture(scope="module")
@@ -70,16 +73,15 @@ def test_a_folder_with_a_map_of_another_origin_is_not_overwritten(data: Training
 def test_other_images_than_at_the_start_are_refused_and_a_missing_checkpoint_begins_again(
     data: TrainingData, tmp_path: Path
 ) -> None:
-    session = session_of(tmp_path, data, every=0)
-    session.resume()
+    session = session_of(tmp_path, data, every=0, resume=True)
     assert session.trainer.iteration == 0
     session.run()
-    fewer = TrainingSession(replace(data, views=data.views[1:]), session.folder, session.folder.load_settings())
     with pytest.raises(InputError, match="other images"):
-        fewer.resume()
+        session_of(tmp_path, replace(data, views=data.views[1:]), every=0, resume=True)
+    assert session_of(tmp_path, data, every=0, resume=True).trainer.iteration == 30
     (tmp_path / "checkpoint.pt").write_bytes((tmp_path / "checkpoint.pt").read_bytes()[:-200])
     with pytest.raises(FormatError, match="damaged"):
-        session.resume()
+        session_of(tmp_path, data, every=0, resume=True)
 
 
 def test_images_beyond_the_free_memory_are_refused_with_a_scale_that_fits() -> None:

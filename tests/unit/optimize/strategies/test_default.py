@@ -12,9 +12,10 @@ from gsplat.strategy import DefaultStrategy as TheirStrategy
 from torch import Tensor
 
 from splatbot.gaussians import GaussianModel
-from splatbot.optimize.adam import PARAMETERS, GaussianAdam
+from splatbot.optimize.adam import PARAMETERS
 from splatbot.optimize.strategies import DefaultStrategy
 from tests.models import random_model
+from tests.unit.optimize.strategies.steps import adam_of, step_of
 
 NAMES = {"means": "means", "quats": "quats", "scales": "log_scales", "opacities": "opacity_logits", "sh": "sh"}
 
@@ -51,8 +52,7 @@ def test_the_same_gaussians_are_cloned_split_and_removed_as_by_gsplat(
     options: dict[str, Any] = {"absgrad": absgrad, "revised_opacity": revised_opacity, "refine_start_iter": 2}
     options |= {"refine_every": 4, "reset_every": 5}
     ours, theirs = DefaultStrategy(**options, refine_stop=1.0), TheirStrategy(**options, refine_stop_iter=1000)
-    adam = GaussianAdam(dict.fromkeys(PARAMETERS, 1e-3))
-    adam.extend(model)
+    adam = adam_of(model)
     state, their_state = ours.initialize_state(model, 2.0), theirs.initialize_state(2.0)
     params, optimizers = theirs_of(model)
     counts = [len(model)]
@@ -60,8 +60,7 @@ def test_the_same_gaussians_are_cloned_split_and_removed_as_by_gsplat(
         meta = meta_of(len(model), rng)
         torch.manual_seed(step)  # theirs draws from the global generator
         theirs.step_post_backward(params, optimizers, their_state, step, meta, packed=True)
-        random = torch.Generator().manual_seed(step)
-        model = ours.step_post_backward(model, adam, state, step, meta, progress=0.1, random=random)  # type: ignore[arg-type]
+        model = ours.step_post_backward(model, state, step_of(step, adam, meta, seed=step))
         assert_same(model, params)
         assert len(adam.steps) == len(model)
         counts.append(len(model))
@@ -70,17 +69,14 @@ def test_the_same_gaussians_are_cloned_split_and_removed_as_by_gsplat(
 
 def test_opacities_are_reset_to_twice_the_limit_and_their_moments_forgotten(rng: np.random.Generator) -> None:
     model = random_model(50, rng)
-    adam = GaussianAdam(dict.fromkeys(PARAMETERS, 1e-3))
-    adam.extend(model)
+    adam = adam_of(model)
     for moments in (adam.first, adam.second):
         for name in PARAMETERS:
             moments[name] += 1.0
     strategy = DefaultStrategy(reset_every=10, refine_start_iter=100)
     state = strategy.initialize_state(model, 1.0)
     opacities = model.opacities
-    changed = strategy.step_post_backward(
-        model, adam, state, 10, meta_of(50, rng), progress=0.1, random=torch.Generator()  # type: ignore[arg-type]
-    )  # fmt: skip
+    changed = strategy.step_post_backward(model, state, step_of(10, adam, meta_of(50, rng)))
     torch.testing.assert_close(changed.opacities, opacities.clamp_max(0.01), rtol=1e-4, atol=1e-6)
     assert not adam.first["opacity_logits"].any()
     assert bool((adam.first["means"] == 1).all())
@@ -89,21 +85,16 @@ def test_opacities_are_reset_to_twice_the_limit_and_their_moments_forgotten(rng:
 def test_the_cap_keeps_the_largest_gradients_and_the_stop_ends_growth(rng: np.random.Generator) -> None:
     model = random_model(300, rng)
     model.opacity_logits[:] = 1.0
-    adam = GaussianAdam(dict.fromkeys(PARAMETERS, 1e-3))
-    adam.extend(model)
+    adam = adam_of(model)
     strategy = DefaultStrategy(refine_start_iter=0, refine_every=1, cap_max=310, grow_scale3d=1e3, refine_stop=0.5)
     meta = meta_of(300, rng)
     meta["means2d"].grad *= 1e3
     state = strategy.initialize_state(model, 1.0)
-    grown = strategy.step_post_backward(
-        model, adam, state, 1, meta, progress=0.1, random=torch.Generator()  # type: ignore[arg-type]
-    )  # fmt: skip
+    grown = strategy.step_post_backward(model, state, step_of(1, adam, meta))
     norms = torch.zeros(300)
     norms[meta["gaussian_ids"]] = (meta["means2d"].grad * torch.tensor([160.0, 120.0])).norm(dim=1)
     most: Tensor = norms.topk(10).indices.sort().values
     assert len(grown) == 310
     torch.testing.assert_close(grown.means[300:], model.means[most])
-    late = strategy.step_post_backward(
-        grown, adam, state, 2, meta, progress=0.5, random=torch.Generator()  # type: ignore[arg-type]
-    )  # fmt: skip
+    late = strategy.step_post_backward(grown, state, step_of(2, adam, meta, progress=0.5))
     assert late is grown

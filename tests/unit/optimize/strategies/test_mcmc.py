@@ -7,10 +7,11 @@ import pytest
 import torch
 
 from splatbot.gaussians.shape import covariances
-from splatbot.optimize.adam import PARAMETERS, GaussianAdam
+from splatbot.optimize.adam import PARAMETERS
 from splatbot.optimize.strategies import MCMCStrategy
 from splatbot.optimize.strategies.edits import compute_relocation, inject_noise, relocate, sample_add
 from tests.models import random_model
+from tests.unit.optimize.strategies.steps import adam_of, step_of
 
 
 @pytest.mark.parametrize("opacity", [1e-6, 0.005, 0.3, 0.9, 0.999, 0.999999])
@@ -38,8 +39,7 @@ def test_dead_gaussians_move_onto_living_ones_which_share_their_opacity(rng: np.
     model.opacity_logits[:] = 0.5
     dead = torch.arange(200) < 60
     model.opacity_logits[dead] = -9.0
-    adam = GaussianAdam(dict.fromkeys(PARAMETERS, 1e-3))
-    adam.extend(model)
+    adam = adam_of(model)
     for name in PARAMETERS:
         adam.first[name] += 1
     moved = relocate(model, adam, dead, least_opacity=0.005, random=torch.Generator().manual_seed(1))
@@ -57,8 +57,7 @@ def test_dead_gaussians_move_onto_living_ones_which_share_their_opacity(rng: np.
 def test_draws_follow_opacity_and_new_rows_begin_without_moments(rng: np.random.Generator) -> None:
     model = random_model(3, rng)
     model.opacity_logits = torch.logit(torch.tensor([0.1, 0.3, 0.6]))
-    adam = GaussianAdam(dict.fromkeys(PARAMETERS, 1e-3))
-    adam.extend(model)
+    adam = adam_of(model)
     grown = sample_add(model, adam, 20_000, least_opacity=0.005, random=torch.Generator().manual_seed(2))
     counts = np.array([int((grown.means[3:] == model.means[i]).all(1).sum()) for i in range(3)])
     assert counts.sum() == 20_000
@@ -89,13 +88,10 @@ def test_noise_has_the_covariance_of_each_faint_gaussian_and_spares_opaque_ones(
 def test_growth_is_five_percent_up_to_the_cap(rng: np.random.Generator) -> None:
     model = random_model(100, rng)
     model.opacity_logits[:] = 2.0
-    adam = GaussianAdam(dict.fromkeys(PARAMETERS, 1e-3))
-    adam.extend(model)
+    adam = adam_of(model)
     strategy = MCMCStrategy(cap_max=107, refine_start_iter=0, refine_every=1)
     sizes = []
     for step in range(1, 4):
-        model = strategy.step_post_backward(
-            model, adam, {}, step, {}, progress=0.1, random=torch.Generator()  # type: ignore[arg-type]
-        )  # fmt: skip
+        model = strategy.step_post_backward(model, {}, step_of(step, adam))
         sizes.append(len(model))
     assert sizes == [105, 107, 107]
