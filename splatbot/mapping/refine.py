@@ -114,7 +114,7 @@ class Refiner:
     def step(
         self, model: GaussianModel, keyframe: Keyframe, position_gradients: PositionGradients | None = None
     ) -> float:
-        """Run one iteration on one keyframe; return the loss before it. An error leaves map and optimizer as they are."""
+        """Run one iteration on one keyframe; return the loss before it. An error leaves map and optimizer unchanged."""
         with one_torch_thread():
             return self._step(model, keyframe, position_gradients)
 
