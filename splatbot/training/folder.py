@@ -50,7 +50,7 @@ class ProgressRow:
         iteration: iterations done.
         seconds: time of training [s], without evaluations.
         loss: mean loss since the last row.
-        psnr_db: mean over the held-out views [dB]; None if they were not scored.
+        psnr_db: mean over at most eight held-out views, the same in each row [dB]; None if they were not scored.
         gaussians: number of Gaussians.
     """
 

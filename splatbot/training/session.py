@@ -186,7 +186,8 @@ class TrainingSession:
             report=lambda done: report(self._progress(f"scoring {done + 1}/{len(self.held_out.views)}")),
         )
         model, result = self.trainer.model, summary(scores)
-        rows = [*self.rows, self._row(result["psnr_db"])]
+        some = scores[:: self._scored_every]
+        rows = [*self.rows, self._row(fmean(score.psnr_db for score in some) if some else None)]
         result |= {
             "iterations": self.trainer.iteration,
             "seconds": round(self.seconds, 1),
@@ -197,17 +198,21 @@ class TrainingSession:
         self.folder.save_scores(rows, result, pictures(rows, scores))
         return result
 
+    @property
+    def _scored_every(self) -> int:
+        """Return the distance of the views that are scored in the course of the run."""
+        return max(1, -(-len(self.held_out.views) // CONSTANTS.scored_views))
+
     def _some_psnr(self) -> float | None:
         """Return the mean PSNR of some held-out views; None with refined poses, whose alignment takes long."""
-        views = self.held_out.views
-        if not views or self.options.refine_poses:
+        if not self.held_out.views or self.options.refine_poses:
             return None
         scores = score_held_out(
             self.trainer.model,
             self.held_out,
             self.options,
             self.trainer.extent,
-            every=-(-len(views) // CONSTANTS.scored_views),
+            every=self._scored_every,
             psnr_only=True,
         )
         return fmean(score.psnr_db for score in scores) if scores else None

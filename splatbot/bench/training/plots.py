@@ -15,7 +15,7 @@ def plot_training(results: Results, out: Path) -> None:
     knobs = list(dict.fromkeys(case.split()[0] for case in curves if case != "(default)"))
     fig, axes = figure(max(1, len(knobs)), width=4.2 * max(1, len(knobs)), height=3.4)
     for ax, knob in zip(axes, knobs or [""], strict=True):
-        ax.plot(*zip(*curves["(default)"], strict=True), color=INK, linewidth=2.5, label="default")
+        ax.plot(*zip(*curves["(default)"], strict=True), color=INK, linewidth=2.5, label="(default)")
         for color, case in zip(SERIES, [c for c in curves if c.split()[0] == knob], strict=False):
             if curves[case]:
                 ax.plot(*zip(*curves[case], strict=True), color=color, marker=".", label=case.partition(" ")[2])
