@@ -18,6 +18,7 @@ PYTEST_ARGS ?=
 
 TORCH_STAMP := $(VENV)/.torch
 INSTALL_STAMP := $(VENV)/.installed
+WERROR_STAMP := $(VENV)/.werror
 MODULES := $(VENV)/.modules
 BUILD_TOOLS := 'scikit-build-core>=0.11' 'nanobind>=2.4' 'cmeel-eigen>=3.4' 'cmake>=3.26' 'ninja>=1.11'
 NEW_DEPENDENCIES = $(filter pyproject.toml $(TORCH_STAMP),$?)
@@ -44,20 +45,20 @@ test: $(INSTALL_STAMP) ## the test suite without its long part (some 25 minutes 
 	$(BIN)/python -m pytest -m "not long" --numprocesses auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder $(PYTEST_ARGS)
 
 .PHONY: test-long
+# Long tests run beside each other as those of `make test` do; those that measure time or use all cores follow alone.
 test-long: $(INSTALL_STAMP) ## the long tests: end-to-end on real logs, browser, load, sanitizers, wheel and sdist (under an hour)
 	.ci/browser-deps.sh
-	$(BIN)/python -m pytest -m long $(PYTEST_ARGS)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m "long and not alone" --numprocesses auto --maxprocesses 2 \
+	  --dist worksteal $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -m "long and alone" $(PYTEST_ARGS)
 
 .PHONY: check
-check: $(INSTALL_STAMP) ## ruff, mypy, layering contract, prose, and the native code with warnings as errors
+check: $(WERROR_STAMP) ## ruff, mypy, layering contract, prose, and the native code with warnings as errors
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python -m tests.prose
-	$(BIN)/cmake -S splatbot/native -B build/werror -G Ninja -DCMAKE_MAKE_PROGRAM=$(CURDIR)/$(BIN)/ninja \
-	  -DPython_EXECUTABLE=$(CURDIR)/$(BIN)/python -DSPLATBOT_WERROR=ON
-	$(BIN)/cmake --build build/werror
 
 .PHONY: figures
 figures: $(INSTALL_STAMP) ## run the commands behind the figures of the documentation, and compare (minutes; needs the test data)
@@ -78,10 +79,19 @@ $(TORCH_STAMP): .ci/system-deps.sh .ci/find-python.sh
 
 # The build tools come before the package, which is then built without isolation: CMake's cache in build/ survives, and
 # a change of one C++ file costs one compilation. Dependencies are looked at again only when pyproject.toml changes.
-$(INSTALL_STAMP): $(TORCH_STAMP) pyproject.toml $(MODULES) $(NATIVE_SOURCES)
-	$(if $(NEW_DEPENDENCIES),$(PIP) install $(BUILD_TOOLS))
-	$(PIP) install --no-build-isolation $(if $(NEW_DEPENDENCIES),,--no-deps) --editable '.[dev]'
-	@touch $@
+INSTALL_INPUTS = $(TORCH_STAMP) pyproject.toml $(MODULES) $(NATIVE_SOURCES)
+define install
+$(if $(NEW_DEPENDENCIES),$(PIP) install $(BUILD_TOOLS))
+$(PIP) install --no-build-isolation $(if $(NEW_DEPENDENCIES),,--no-deps) $(1) --editable '.[dev]'
+@touch $(INSTALL_STAMP) $@
+endef
+
+$(INSTALL_STAMP): $(INSTALL_INPUTS)
+	$(call install)
+
+# Compiles the same build once more only if the first one had no warnings as errors; CMake's cache keeps the option.
+$(WERROR_STAMP): $(INSTALL_INPUTS)
+	$(call install,--config-settings=cmake.define.SPLATBOT_WERROR=ON)
 
 # An editable install knows the modules by name: a new, moved or removed one needs a new install. Rewritten only then.
 $(MODULES): $(TORCH_STAMP) FORCE

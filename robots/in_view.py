@@ -31,7 +31,13 @@ def without_robot(log: Log, robot: str | None) -> Log:
             field="T_link_camera",
             hint="write translation and quaternion_wxyz of the camera on its link, and camera_link (-1: the last)",
         )
-    return MaskedLog(log, SelfMask(load_robot(robot), workspace.T_link_camera, link=workspace.camera_link))
+    mask = SelfMask(
+        load_robot(robot),
+        workspace.T_link_camera,
+        link=workspace.camera_link,
+        joint_offsets=workspace.joint_offsets,
+    )
+    return MaskedLog(log, mask)
 
 
 def reopen_log(run: RunFolder, *, uri: str | None = None, camera: str | None = None) -> Log:

@@ -18,7 +18,16 @@ from splatbot.geometry import pose_from_quat, rotation_to_quat, transform_points
 Array = NDArray[np.float64]
 
 NAME = "scene.yaml"
-_KEYS = ("T_world_base", "gravity", "support_plane", "workspace", "T_link_camera", "camera_link", "objects")
+_KEYS = (
+    "T_world_base",
+    "gravity",
+    "support_plane",
+    "workspace",
+    "T_link_camera",
+    "camera_link",
+    "objects",
+    "joint_offsets",
+)
 
 
 @dataclass(frozen=True)
@@ -40,6 +49,7 @@ class WorkspaceConstants:
 
 
 CONSTANTS = WorkspaceConstants()
+_LEAST_NORMAL = 1e-9  # [m²] of the cross product of two edges, of which collinear points have none
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +81,7 @@ class Workspace:
         T_link_camera: (4, 4) pose of the camera on its link [m].
         camera_link: index of the link that carries the camera; -1 is the last one, 0 the base.
         objects: named objects.
+        joint_offsets: (J,) offsets to be added to measured joint positions [rad or m].
 
     Raises:
         InputError: a value has a wrong shape, is not finite, or is no rigid pose, no unit vector or an empty box.
@@ -83,6 +94,7 @@ class Workspace:
     T_link_camera: Array | None = None
     camera_link: int = -1
     objects: tuple[NamedPlace, ...] = ()
+    joint_offsets: Array | None = None
 
     def __post_init__(self) -> None:
         _check("T_world_base", self.T_world_base, (4, 4), "a pose")
@@ -95,6 +107,8 @@ class Workspace:
         if self.box is not None and not (self.box[1] > self.box[0]).all():
             raise InputError("is empty.", field="workspace", hint="give low corners below high ones")
         _check("T_link_camera", self.T_link_camera, (4, 4), "a pose")
+        if self.joint_offsets is not None:
+            _check("joint_offsets", self.joint_offsets, (self.joint_offsets.size,), "one number for each joint")
         for name, T in (("T_world_base", self.T_world_base), ("T_link_camera", self.T_link_camera)):
             if T is not None and np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > 1e-6:
                 raise InputError("is no rigid pose.", field=name, hint="give a rotation and a translation")
@@ -126,6 +140,7 @@ class Workspace:
                 T_link_camera=_pose(found, "T_link_camera"),
                 camera_link=found.get("camera_link", -1),
                 objects=_places(found.get("objects")),
+                joint_offsets=_array(found.get("joint_offsets"), "joint_offsets"),
             )
         except InputError as error:
             raise FormatError(error.message, file=path, field=error.field, hint=error.hint) from error
@@ -142,6 +157,8 @@ class Workspace:
         for key, value in zip(_KEYS[1:4], (self.gravity, self.support_plane, self.box), strict=True):
             if value is not None:
                 document[key] = _plain(value, 9)
+        if self.joint_offsets is not None:
+            document["joint_offsets"] = _plain(self.joint_offsets)
         if self.objects:
             document["objects"] = [
                 {"name": o.name, "at": _plain(o.at)} | ({"aliases": list(o.aliases)} if o.aliases else {})
@@ -192,15 +209,14 @@ def fit_workspace(model: GaussianModel, *, up: ArrayLike = (0.0, -1.0, 0.0), see
     rng = np.random.default_rng(seed)
     some = points[rng.choice(len(points), min(len(points), 4000), replace=False)]
     best, best_score, count = np.zeros(4), 0.0, 0
-    for trio in rng.integers(0, len(some), (CONSTANTS.ransac_trials, 3)):
-        a, b, c = some[trio]
-        plane = _through(np.cross(b - a, c - a), a, upward)
-        if plane is None or plane[3] <= 0.0:
-            continue
-        inliers = int((np.abs(some @ plane[:3] + plane[3]) < CONSTANTS.inlier_distance).sum())
-        score = inliers * float(plane[:3] @ upward) ** CONSTANTS.tilt_exponent
-        if score > best_score:
-            best, best_score, count = plane, score, inliers
+    trios = some[rng.integers(0, len(some), (CONSTANTS.ransac_trials, 3))]
+    for some_trios in np.array_split(trios, max(1, len(trios) // 250)):  # 8 MB of distances at a time
+        planes = _through_trios(some_trios, upward)
+        inliers = (np.abs(planes[:, :3] @ some.T + planes[:, 3:]) < CONSTANTS.inlier_distance).sum(axis=1)
+        scores = inliers * (planes[:, :3] @ upward) ** CONSTANTS.tilt_exponent
+        if len(scores) and scores.max() > best_score:
+            k = int(scores.argmax())
+            best, best_score, count = planes[k], float(scores[k]), int(inliers[k])
     if count < len(some) / 20:
         raise InputError("has no upward surface.", field="map", hint="write scene.yaml by hand")
     for _ in range(5):  # least squares on the inliers
@@ -211,10 +227,21 @@ def fit_workspace(model: GaussianModel, *, up: ArrayLike = (0.0, -1.0, 0.0), see
     return _around(best, points[np.abs(points @ best[:3] + best[3]) < CONSTANTS.inlier_distance])
 
 
+def _through_trios(trios: Array, up: Array) -> Array:
+    """Return the planes (M, 4) below the first camera through three points each (N, 3, 3), M <= N."""
+    normals = np.cross(trios[:, 1] - trios[:, 0], trios[:, 2] - trios[:, 0])
+    lengths = np.linalg.norm(normals, axis=1)
+    firm = lengths > _LEAST_NORMAL
+    n = normals[firm] / lengths[firm, None]
+    n *= np.where(n @ up < 0, -1.0, 1.0)[:, None]
+    d = -(n * trios[firm, 0]).sum(axis=1)
+    return np.column_stack([n, d])[d > 0.0]
+
+
 def _through(normal: Array, point: Array, up: Array) -> Array | None:
     """Return the plane (4,) through a point with its normal upwards, or None for collinear points."""
     length = float(np.linalg.norm(normal))
-    if length < 1e-9:
+    if length < _LEAST_NORMAL:
         return None
     n = normal / length
     n = -n if n @ up < 0 else n

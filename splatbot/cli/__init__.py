@@ -66,11 +66,21 @@ CALIBRATIONS = {
         "calibrate_sensor_command",
         "Estimate readout, delays, registration and bias of an RGB-D sensor from a log.",
     ),
+    "intrinsics": _Command(
+        "splatbot.cli.calibrate_arm",
+        "calibrate_intrinsics_command",
+        "Estimate the intrinsics of a camera from views of a ChArUco board.",
+    ),
+    "hand-eye": _Command(
+        "splatbot.cli.calibrate_arm",
+        "calibrate_hand_eye_command",
+        "Estimate the camera's pose on an arm, joint offsets and the time offset, with a board or without.",
+    ),
 }
 
 _GROUPS = {
     "bench": "Measure speed, and accuracy over time; `splatbot bench --help` lists the benchmarks.",
-    "calibrate": "Calibrate a sensor from a log; `splatbot calibrate --help` lists the calibrations.",
+    "calibrate": "Calibrate cameras, sensors and arms; `splatbot calibrate --help` lists the calibrations.",
 }
 
 _HELP_COLUMNS = 120  # widest text of a help

@@ -39,6 +39,7 @@ def map_log_command(
     localise: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None,
     overwrite: bool = False,
     robot: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None,
+    no_report: bool = False,
     dump_config: bool = False,
     quiet: bool = False,
 ) -> int:
@@ -79,6 +80,7 @@ def map_log_command(
             arbitrary, and is accepted when the second agrees.
         overwrite: replace the run that --out holds.
         robot: mask this robot in the frames, by the log's joints.txt and the T_link_camera of its scene.yaml.
+        no_report: write no audit, report.html and map.html, which take seconds; `splatbot audit RUN` audits later.
         dump_config: print the configuration in force and leave.
         quiet: no progress and no summary, only errors.
     """
@@ -128,6 +130,7 @@ def map_log_command(
             localise=saved if localise is not None else None,
             source={"camera": _lasting(camera) if camera else None, "robot": robot},
             map_page=page_of_map,
+            report=not no_report,
         )
     if out is None:
         _link_latest(folder)
@@ -243,7 +246,7 @@ def _print_summary(result: RunResult) -> None:
         ("Gaussians", f"{count(m['gaussians'])}, {megabytes(m['map_bytes'])}"),
         ("time per frame", f"median {milliseconds(ms['p50'])}, 95 % {milliseconds(ms['p95'])}"),
         *(("question", doubt) for doubt in run_doubts(m)),
-        ("report", str(result.folder / "report.html")),
+        *([("report", str(result.folder / "report.html"))] if (result.folder / "report.html").exists() else []),
     ]
     title = "interrupted; saved" if m["interrupted"] else "stopped early; saved" if m["error"] else "mapped"
     print_table(rows, title=f"{m['log']['name']}: {title}")

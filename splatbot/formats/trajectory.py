@@ -20,8 +20,12 @@ from splatbot.trajectory import Trajectory
 _LAYOUT = "`stamp tx ty tz qx qy qz qw`"
 
 
-def load_trajectory(path: str | Path) -> Trajectory:
-    """Read a TUM trajectory; ``#`` starts a comment, quaternions are normalised.
+def load_trajectory(path: str | Path, *, unordered: bool = False) -> Trajectory:
+    """Read a TUM trajectory; ``#`` starts a comment, quaternions are normalised. Commas may separate the values.
+
+    Args:
+        path: the file.
+        unordered: sort the poses by time, and keep the first of equal stamps.
 
     Raises:
         FormatError: the file is missing or has no poses, a line is malformed, or the stamps do not increase.
@@ -34,6 +38,8 @@ def load_trajectory(path: str | Path) -> Trajectory:
     if not numbered:
         raise FormatError("has no poses.", file=path, field="trajectory", hint=f"write one line {_LAYOUT} a pose")
     rows = np.array([_parse(path, number, line) for number, line in numbered])
+    if unordered:
+        rows = rows[np.unique(rows[:, 0], return_index=True)[1]]
     late = np.diff(rows[:, 0]) <= 0
     if late.any():
         raise FormatError(

@@ -14,7 +14,7 @@ MAX_GAP = 0.1  # [s] to the neighbouring lines beyond which joint positions are 
 
 
 class JointRecord:
-    """Joint positions over time with linear interpolation.
+    """Joint positions over time with linear interpolation: ``stamps`` (N,) [s] and ``joints`` (N, J) [rad].
 
     Args:
         path: the file.
@@ -47,11 +47,11 @@ class JointRecord:
         if not rows:
             raise LogError("is empty.", file=path, hint="write lines `stamp q1 q2 ...`, or remove it")
         table = np.array(rows)
-        self._stamps, self._joints = table[:, 0], table[:, 1:]
+        self.stamps, self.joints = table[:, 0], table[:, 1:]
 
     def at(self, stamp: float) -> NDArray[np.float64] | None:
         """Interpolate the positions (J,) [rad] at a stamp [s]; None if a neighbouring line is more than 0.1 s away."""
-        return interpolate_joints(self._stamps, self._joints, stamp)
+        return interpolate_joints(self.stamps, self.joints, stamp)
 
 
 def interpolate_joints(

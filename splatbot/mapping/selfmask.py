@@ -29,9 +29,11 @@ class SelfMask:
         link: index of the link that carries the camera. -1 is the last one; 0 is the base, for a static camera.
         opening: opening of the gripper [m]. If None, the gripper is fully open.
         reach: enlargement of the spheres [m].
+        joint_offsets: (J,) added to measured joint positions [rad or m]; see `splatbot calibrate hand-eye`.
 
     Raises:
-        InputError: The camera pose is not rigid, the link does not exist, or the reach is negative.
+        InputError: The camera pose is not rigid, the link does not exist, the reach is negative, or the offsets are not
+            one for each joint.
     """
 
     def __init__(
@@ -42,6 +44,7 @@ class SelfMask:
         link: int = -1,
         opening: float | None = None,
         reach: float = REACH,
+        joint_offsets: ArrayLike | None = None,
     ) -> None:
         links = len(robot.chain) + 1
         if not -links <= link < links:
@@ -53,6 +56,10 @@ class SelfMask:
             raise InputError(
                 "is no rigid pose.", field="T_link_camera", hint="give (4, 4) with an orthonormal rotation"
             )
+        self._offsets = np.zeros(links - 1) if joint_offsets is None else np.asarray(joint_offsets, np.float64)
+        if self._offsets.shape != (links - 1,) or not np.isfinite(self._offsets).all():
+            shape = self._offsets.shape
+            raise InputError(f"is {shape}.", field="joint_offsets", hint=f"{robot.name} has {links - 1} joints")
         self._arm = RobotSpheres(robot, opening=opening)
         self._T_link_camera, self._link, self._reach = T, link % links, reach
         self._radii = self._arm.spheres.radii + reach
@@ -78,7 +85,7 @@ class SelfMask:
             count = "no" if frame.joints is None else str(len(frame.joints))
             hint = f"record the joints of {self._arm.robot.name} with the frames, or map without its mask"
             raise InputError(f"has {count} joints.", file=where, field="joints", hint=hint)
-        q = np.asarray(frame.joints[:joints], dtype=np.float64)  # a gripper's own may follow
+        q = np.asarray(frame.joints[:joints], dtype=np.float64) + self._offsets  # a gripper's own may follow
         T_base_camera = self._arm.forward(q)[0, self._link] @ self._T_link_camera
         centers = transform_points(inverse(T_base_camera), self._arm.centers(q)[0])
         hidden = np.zeros(frame.depth.shape, np.bool_)

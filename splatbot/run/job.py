@@ -57,6 +57,7 @@ def map_log(
     source: dict[str, Any] | None = None,
     effects: Sequence[Mapping[str, Any]] | None = None,
     map_page: MapPage | None = None,
+    report: bool = True,
 ) -> RunResult:
     """Map a log and write the run folder ``out``.
 
@@ -83,6 +84,7 @@ def map_log(
         source: further arguments needed to open the log again; ``metrics.json`` keeps them under "log".
         effects: description of the sensor effects that the log's frames went through. If None, that of the log.
         map_page: makes a page of the finished map for the report. If None, the report has no such page.
+        report: audit the map against measured depth and write the report, which takes seconds.
 
     Raises:
         LogError: The log is empty, no frame could be read, or it is not the log of ``resume``; no file is written.
@@ -121,6 +123,7 @@ def map_log(
                 loop=loop,
                 source=source or {},
                 map_page=map_page,
+                report=report,
                 localised_in=str(localise.folder.resolve()) if localise is not None else None,
                 effects=list(log.effects if effects is None else effects),
                 interrupts=interrupts,

@@ -8,6 +8,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from splatbot import __version__
 from splatbot.errors import SplatbotError
 from splatbot.gaussians import GaussianModel
@@ -44,6 +47,7 @@ class RunOutcome:
     finished: bool = False
     localised_in: str | None = None
     map_page: MapPage | None = None
+    report: bool = True
     audit: RunAudit | None = None
 
     def save(self, folder: RunFolder) -> None:
@@ -54,7 +58,9 @@ class RunOutcome:
         mapping_cut = self.interrupts.requested is not None
         try:
             with self.interrupts.interruptible(after=int(mapping_cut)):
-                self._score_and_report(folder)
+                self._score(folder)
+                if self.report:
+                    self._audit_and_report(folder)
         except KeyboardInterrupt:
             folder.save_metrics(self.metrics())
 
@@ -68,9 +74,9 @@ class RunOutcome:
             metrics=self.metrics(),
         )
 
-    def _score_and_report(self, folder: RunFolder) -> None:
+    def _score(self, folder: RunFolder) -> None:
         self.loop.progress("scoring")
-        poses = {r.index: r.T_world_camera for r in self.loop.slam.results if r.T_world_camera is not None}
+        poses = self._poses()
         held_out = {i: poses[i] for i in sorted(self.loop.held_out) if i in poses}
         log = RectifiedLog(self.loop.source.log, self.loop.config.sensor, self.trajectory)
         self.views = score_views(
@@ -79,7 +85,10 @@ class RunOutcome:
             held_out,
             lambda number: self.loop.progress("scoring", step=number, steps=len(held_out)),
         )
-        self.audit = audit_run(folder, self.loop.source.log) if poses else None
+        folder.save_metrics(self.metrics())
+
+    def _audit_and_report(self, folder: RunFolder) -> None:
+        self.audit = audit_run(folder, self.loop.source.log) if self._poses() else None
         folder.save_metrics(self.metrics())
         if self.audit is not None:
             folder.save_audit(self.audit.summary())
@@ -97,6 +106,10 @@ class RunOutcome:
                 audit=self.audit,
             )
         )
+
+    def _poses(self) -> dict[int, NDArray[np.float64]]:
+        """Return the poses of the tracked frames by their index."""
+        return {r.index: r.T_world_camera for r in self.loop.slam.results if r.T_world_camera is not None}
 
     def _save_map_page(self, folder: RunFolder) -> str | None:
         """Write the map page; return its name for the report, or None if it was not written."""

@@ -246,6 +246,7 @@ def process(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, Pat
 
 
 @pytest.mark.long
+@pytest.mark.alone
 def test_idle_sockets_beyond_the_files_of_the_process_do_not_make_it_deaf(process: tuple[str, Path]) -> None:
     url, log = process
     port = int(url.rsplit(":", 1)[1])
@@ -261,6 +262,7 @@ def test_idle_sockets_beyond_the_files_of_the_process_do_not_make_it_deaf(proces
 
 
 @pytest.mark.long
+@pytest.mark.alone
 def test_health_is_quick_while_50_plans_are_asked_for(process: tuple[str, Path]) -> None:
     url, _ = process
     base = {"translation": [0.0, 0.5, -1.0], "quaternion_wxyz": [0.7071068, 0.7071068, 0.0, 0.0]}

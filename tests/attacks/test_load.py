@@ -9,6 +9,7 @@ from tests.attacks.soak import NAMES, soak
 
 
 @pytest.mark.long
+@pytest.mark.alone
 def test_mixed_clients_get_answers_while_a_log_is_mapped() -> None:
     times = measure(8.0, 20)
     times.statuses.pop("503, asked again", None)
@@ -18,6 +19,7 @@ def test_mixed_clients_get_answers_while_a_log_is_mapped() -> None:
 
 
 @pytest.mark.long
+@pytest.mark.alone
 def test_maps_and_clients_that_come_and_go_leave_nothing() -> None:
     _, found = soak(30.0)
     assert len(found) > 2

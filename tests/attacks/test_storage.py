@@ -288,6 +288,7 @@ def test_deleted_maps_leave_no_threads_descriptors_or_metric_series(tmp_path: Pa
 
 
 @pytest.mark.long
+@pytest.mark.alone
 def test_sigterm_ends_within_eight_seconds_while_a_big_upload_is_unpacked(tmp_path: Path) -> None:
     os.environ["TMPDIR"], before = str(tmp_path), os.environ.get("TMPDIR")
     try:

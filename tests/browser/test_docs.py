@@ -11,7 +11,7 @@ from splatbot.services.settings import ServiceSettings
 from tests.browser.chromium import Chromium
 from tests.contracts.conftest import running
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.alone]
 
 
 def test_the_docs_list_the_routes_without_another_host(tmp_path: Path) -> None:

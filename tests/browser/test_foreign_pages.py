@@ -19,7 +19,7 @@ from splatbot.services.viewer.viewer import Viewer
 from tests.browser.chromium import Chromium
 from tests.contracts.conftest import Service, running, wall
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.alone]
 
 ATTACK = """
 (async (service, viewer, query) => {

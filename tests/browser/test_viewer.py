@@ -31,7 +31,7 @@ from splatbot.slam import FrameResult
 from splatbot.workspace import Workspace
 from tests.browser.chromium import Chromium
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.alone]
 
 WIDTH, HEIGHT, FOV = 1100, 480, 50.0  # the panel covers the right 330
 EYE, TARGET = np.array([1.6, -1.2, 1.0]), np.array([0.3, 0.0, 0.4])

@@ -74,6 +74,7 @@ CHECKS: dict[str, tuple[Callable[[Path, Path], None], ...]] = {
 }
 
 
+@pytest.mark.timeout(1500)
 @pytest.mark.parametrize(("name", "frames", "ate_m"), LOGS)
 def test_every_frame_is_tracked_within_the_bound(
     data_root: Path, tmp_path: Path, name: str, frames: int, ate_m: float

@@ -53,9 +53,10 @@ def test_every_module_of_the_core_is_under_the_contract_on_external_packages() -
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with an sdist of this checkout and the wheel built from that sdist."""
+    """A folder with an sdist of this checkout and the wheel built from that sdist, without optimization."""
     out = tmp_path_factory.mktemp("dist")
-    _run(sys.executable, "-m", "build", "--no-isolation", "--outdir", str(out), str(ROOT))
+    options = ("--no-isolation", "--config-setting=cmake.build-type=Debug", "--outdir", str(out))
+    _run(sys.executable, "-m", "build", *options, str(ROOT))
     return out
 
 
@@ -66,6 +67,7 @@ def _run(*command: str, cwd: Path | None = None, env: dict[str, str] | None = No
 
 
 @pytest.mark.long
+@pytest.mark.alone
 def test_the_wheel_that_is_built_from_the_sdist_is_whole_when_installed(built: Path, tmp_path: Path) -> None:
     """`pip install` of the sdist builds the same wheel; a second compilation would take minutes."""
     (archive,) = built.glob("*.whl")

@@ -92,7 +92,7 @@ def test_a_run_leaves_every_file_and_every_documented_metric(log: Log, tmp_path:
 
 
 def test_stages_without_time_and_skipped_gradients_are_reported(log: Log, tmp_path: Path) -> None:
-    result = map_log(log, out=tmp_path / "run", slam=oracle(log, degraded=(6,)))
+    result = map_log(log, out=tmp_path / "run", slam=oracle(log, degraded=(6,)), report=False)
     lines = (tmp_path / "run" / "frames.jsonl").read_text(encoding="utf-8").splitlines()
     assert [json.loads(line)["skipped"] for line in lines[5:7]] == [[], ["features"]]
     assert result.metrics["skipped_gradients"] == 0
@@ -100,7 +100,7 @@ def test_stages_without_time_and_skipped_gradients_are_reported(log: Log, tmp_pa
 
 def test_held_out_frames_never_enter_the_map_and_are_scored(log: Log, tmp_path: Path) -> None:
     slam = oracle(log)
-    result = map_log(log, out=tmp_path / "run", slam=slam)
+    result = map_log(log, out=tmp_path / "run", slam=slam, report=False)
     assert [index for index, hold_out in slam.seen if hold_out] == [7, 15]
     assert result.metrics["held_out"] == 2
     assert result.metrics["psnr_holdout_db"] > 0
@@ -109,13 +109,13 @@ def test_held_out_frames_never_enter_the_map_and_are_scored(log: Log, tmp_path: 
 
 def test_no_frame_is_held_out_if_configured_so(log: Log, tmp_path: Path) -> None:
     config = load_config(overrides={"mapping.holdout_every": 0}, environ={})
-    result = map_log(log, out=tmp_path / "run", slam=oracle(log), config=config)
+    result = map_log(log, out=tmp_path / "run", slam=oracle(log), config=config, report=False)
     assert result.metrics["held_out"] == 0
     assert result.metrics["psnr_holdout_db"] is None
 
 
 def test_the_trajectory_holds_the_tracked_frames_only(log: Log, tmp_path: Path) -> None:
-    result = map_log(log, out=tmp_path / "run", slam=oracle(log, lost=(3, 4), degraded=(6,)))
+    result = map_log(log, out=tmp_path / "run", slam=oracle(log, lost=(3, 4), degraded=(6,)), report=False)
     assert (result.metrics["tracked"], result.metrics["lost"], result.metrics["degraded"]) == (14, 2, 1)
     saved = Trajectory.load(tmp_path / "run" / "trajectory.tum")
     assert len(saved) == 14
@@ -130,7 +130,7 @@ def test_errors_are_null_without_a_reference(make_log: MakeLog, tmp_path: Path) 
     truth = open_log(folder).ground_truth
     assert truth is not None
     (folder / "groundtruth.txt").unlink()
-    metrics = map_log(open_log(folder), out=tmp_path / "run", slam=OracleSlam(truth)).metrics
+    metrics = map_log(open_log(folder), out=tmp_path / "run", slam=OracleSlam(truth), report=False).metrics
     assert metrics["ate_rmse_m"] is None
     assert metrics["rpe_trans_rmse_m"] is None
     assert metrics["psnr_holdout_db"] is not None
@@ -168,12 +168,12 @@ def test_a_bad_frame_can_be_skipped(make_log: MakeLog, tmp_path: Path) -> None:
 
 def test_a_bad_first_frame_is_an_error_and_an_older_run_stays_as_it_was(make_log: MakeLog, tmp_path: Path) -> None:
     good = open_log(make_log(8))
-    map_log(good, out=tmp_path / "run", slam=oracle(good))
+    map_log(good, out=tmp_path / "run", slam=oracle(good), report=False)
     before = {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir()}
     folder = make_log(8, name="other")
     truncate(folder / "rgb" / "000000.png")
     with pytest.raises(LogError, match=r"000000\.png"):
-        map_log(open_log(folder), out=tmp_path / "run", slam=oracle(good))
+        map_log(open_log(folder), out=tmp_path / "run", slam=oracle(good), report=False)
     assert {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir()} == before
 
 
@@ -183,7 +183,7 @@ def test_when_every_frame_is_bad_skipping_does_not_make_an_empty_run(make_log: M
         truncate(path)
     log = open_log(folder)
     with pytest.raises(LogError, match=r"000000\.png"):
-        map_log(log, out=tmp_path / "run", slam=oracle(log), on_bad_frame="skip")
+        map_log(log, out=tmp_path / "run", slam=oracle(log), on_bad_frame="skip", report=False)
     assert not (tmp_path / "run").exists()
 
 
@@ -235,7 +235,7 @@ def test_many_ctrl_c_in_a_frame_or_while_saving_lose_no_state(phase: str, log: L
                 os.kill(os.getpid(), signal.SIGINT)
 
     limit = None if phase == "mapping" else 5
-    map_log(log, out=tmp_path / "run", on_progress=on_progress, max_frames=limit, save_every=1e9)
+    map_log(log, out=tmp_path / "run", on_progress=on_progress, max_frames=limit, save_every=1e9, report=False)
     assert SavedRun.load(tmp_path / "run").place.next_index == 5
     assert read(tmp_path / "run")["interrupted"] is True
 
@@ -284,7 +284,7 @@ def test_ctrl_c_before_the_first_frame_is_just_an_interrupt(log: Log, tmp_path: 
 
 def test_a_crash_of_the_slam_is_raised_after_the_map_is_saved(log: Log, tmp_path: Path) -> None:
     with pytest.raises(RuntimeError, match="crashed on purpose"):
-        map_log(log, out=tmp_path / "run", slam=oracle(log, crash_at=6))
+        map_log(log, out=tmp_path / "run", slam=oracle(log, crash_at=6), report=False)
     assert len(Trajectory.load(tmp_path / "run" / "trajectory.tum")) == 6
     assert len(GaussianModel.load(tmp_path / "run" / "map.ply")) > 0
 
@@ -298,7 +298,7 @@ def test_a_folder_is_used_again_and_every_file_is_of_the_new_run(make_log: MakeL
 
 
 def test_scoring_the_folder_again_gives_the_same_figures(log: Log, tmp_path: Path) -> None:
-    metrics = map_log(log, out=tmp_path / "run", slam=oracle(log, lost=(5,))).metrics
+    metrics = map_log(log, out=tmp_path / "run", slam=oracle(log, lost=(5,)), report=False).metrics
     scores = rescore(RunFolder(tmp_path / "run"), log)
     assert scores["tracked"] == 15
     for name in ("ate_rmse_m", "rpe_trans_rmse_m", "psnr_holdout_db", "ssim_holdout", "depth_l1_m", "depth_median_m"):
@@ -306,13 +306,13 @@ def test_scoring_the_folder_again_gives_the_same_figures(log: Log, tmp_path: Pat
 
 
 def test_scoring_against_the_wrong_log_is_refused(log: Log, make_log: MakeLog, tmp_path: Path) -> None:
-    map_log(log, out=tmp_path / "run", slam=oracle(log))
+    map_log(log, out=tmp_path / "run", slam=oracle(log), report=False)
     with pytest.raises(FormatError, match="--log"):
         rescore(RunFolder(tmp_path / "run"), open_log(make_log(4, name="short")))
 
 
 def test_a_lost_pose_file_is_noticed(log: Log, tmp_path: Path) -> None:
-    map_log(log, out=tmp_path / "run", slam=oracle(log))
+    map_log(log, out=tmp_path / "run", slam=oracle(log), report=False)
     lines = (tmp_path / "run" / "trajectory.tum").read_text().splitlines(keepends=True)
     (tmp_path / "run" / "trajectory.tum").write_text("".join(lines[:-1]))
     with pytest.raises(FormatError, match="checksum"):
@@ -335,18 +335,18 @@ def test_memory_does_not_grow_with_the_log(log: Log, tmp_path: Path) -> None:
             return super().process(frame, hold_out=hold_out)
 
     assert log.ground_truth is not None
-    map_log(log, out=tmp_path / "run", slam=Watched(log.ground_truth))
+    map_log(log, out=tmp_path / "run", slam=Watched(log.ground_truth), report=False)
     assert most <= 2
 
 
 def test_the_configuration_in_force_is_kept(log: Log, tmp_path: Path) -> None:
     config = load_config(overrides={"mapping.max_gaussians": 12345, "mapping.holdout_every": 4}, environ={})
-    map_log(log, out=tmp_path / "run", slam=oracle(log), config=config)
+    map_log(log, out=tmp_path / "run", slam=oracle(log), config=config, report=False)
     assert RunFolder(tmp_path / "run").load_config() == config != Config()
 
 
 def test_max_frames_ends_the_run_early(log: Log, tmp_path: Path) -> None:
-    assert map_log(log, out=tmp_path / "run", slam=oracle(log), max_frames=5).metrics["frames"] == 5
+    assert map_log(log, out=tmp_path / "run", slam=oracle(log), max_frames=5, report=False).metrics["frames"] == 5
 
 
 def test_a_folder_that_cannot_be_written_is_named_before_anything_is_computed(log: Log, tmp_path: Path) -> None:
@@ -394,7 +394,7 @@ def test_a_run_in_real_time_counts_dropped_and_late_frames(log: Log, tmp_path: P
 def test_an_invalid_rate_is_refused_before_a_frame_is_read(rate: float, log: Log, tmp_path: Path) -> None:
     slam = oracle(log)
     with pytest.raises(InputError, match="rate"):
-        map_log(log, out=tmp_path / "run", slam=slam, rate=rate)
+        map_log(log, out=tmp_path / "run", slam=slam, rate=rate, report=False)
     assert not slam.seen
 
 
@@ -406,10 +406,10 @@ def test_a_frame_of_another_size_ends_the_run_or_is_left_out(log: Log, tmp_path:
             return super().process(frame, hold_out=hold_out)
 
     assert log.ground_truth is not None
-    stopped = map_log(log, out=tmp_path / "stop", slam=Strict(log.ground_truth))
+    stopped = map_log(log, out=tmp_path / "stop", slam=Strict(log.ground_truth), report=False)
     assert stopped.metrics["frames"] == 7
     assert stopped.exit_code == 2
-    skipped = map_log(log, out=tmp_path / "skip", slam=Strict(log.ground_truth), on_bad_frame="skip")
+    skipped = map_log(log, out=tmp_path / "skip", slam=Strict(log.ground_truth), on_bad_frame="skip", report=False)
     assert (skipped.metrics["frames"], skipped.metrics["skipped"], skipped.metrics["held_out"]) == (15, 1, 1)
 
 

@@ -10,6 +10,7 @@ from splatbot.bench.service import BENCHMARK, ServiceBenchSettings
 
 
 @pytest.mark.long
+@pytest.mark.alone
 def test_queries_are_sent_at_fixed_times_and_all_are_answered(tmp_path: Path) -> None:
     values = {**ServiceBenchSettings.quick_values, "per_s": 4.0}
     results = BENCHMARK.run(ServiceBenchSettings(out=tmp_path, **values))

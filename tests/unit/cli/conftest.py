@@ -81,5 +81,5 @@ def log_folder(make_log: Callable[..., Path], monkeypatch: pytest.MonkeyPatch) -
 @pytest.fixture
 def run_folder(run: RunCommand, log_folder: Path, tmp_path: Path) -> Path:
     """The folder of a finished run of ``log_folder``."""
-    assert run("map", log_folder, "--out", tmp_path / "run", "--quiet").code == 0
+    assert run("map", log_folder, "--out", tmp_path / "run", "--no-report", "--quiet").code == 0
     return tmp_path / "run"

@@ -1,16 +1,22 @@
-"""`splatbot calibrate sensor`: a camera file that maps a log, and the refusal of a log at rest."""
+"""`splatbot calibrate`: files that later commands take, and the refusal of values that views do not determine."""
 
 from __future__ import annotations
 
 import json
+import re
+import zipfile
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
+from splatbot.calibration.views import read_views
 from splatbot.config import Config, load_config, with_sensor
-from splatbot.errors import ConfigError
+from splatbot.errors import ConfigError, FormatError
 from splatbot.logs import open_log, record
 from splatbot.logs.calibration import read_calibration
+from splatbot.workspace import Workspace
 from tests.unit.cli.conftest import RunCommand
 
 MOVING = "synthetic:room?trajectory=turns&frames=45&width=320&height=240"
@@ -58,3 +64,95 @@ def test_a_wrong_value_of_a_sensor_is_named() -> None:
             with_sensor(Config(), values, file="camera.json")
         assert caught.value.field == f"sensor.{next(iter(values))}"
         assert "camera.json" in str(caught.value)
+
+
+BOARD = "charuco:10x14:0.07:0.04"
+
+
+def test_images_of_a_board_give_a_camera_file_and_a_scene(run: RunCommand, tmp_path: Path, data_root: Path) -> None:
+    images = data_root / "panda_charuco_32"
+    answer = run("calibrate", "intrinsics", images, "--board", BOARD, "--out", tmp_path / "camera.json")
+    assert answer.code == 0
+    assert "614.7 ±" in answer.out
+    assert read_calibration(tmp_path / "camera.json").camera.width == 640
+    scene = tmp_path / "scene.yaml"
+    Workspace(gravity=np.array([0.0, 0.0, -1.0])).save(scene)
+    words = ("--board", BOARD, "--camera", tmp_path / "camera.json", "--robot", "panda", "--out", scene)
+    answer = run("calibrate", "hand-eye", images, *words)
+    assert answer.code == 0
+    assert re.search(r"panda_joint5 +\+1[01]\.\d ± 0\.\d mrad", answer.out)
+    assert "not known: it turns the base" in answer.out
+    written = Workspace.load(scene)
+    assert written.gravity is not None  # kept
+    assert written.joint_offsets is not None
+    assert written.T_link_camera is not None
+    assert written.joint_offsets[4] == pytest.approx(0.011, abs=0.002)
+    assert np.linalg.norm(written.T_link_camera[:3, 3]) == pytest.approx(0.14, abs=0.02)
+
+
+def test_recorded_poses_of_the_hand_do_without_a_robot(run: RunCommand, data_root: Path) -> None:
+    answer = run("calibrate", "hand-eye", data_root / "panda_charuco_32", "--board", BOARD)
+    assert answer.code == 0
+    assert "joint" not in answer.out.replace("without joint offsets", "")
+
+
+def test_two_pose_files_of_one_motion_give_the_hand_eye_pose_and_the_time_offset(
+    run: RunCommand, tmp_path: Path, data_root: Path
+) -> None:
+    with zipfile.ZipFile(data_root / "hand_eye_time_offset" / "robot_arm_w_color_camera_real.zip") as archive:
+        archive.extractall(tmp_path)
+    (arm,), (camera,) = (list(tmp_path.rglob(f"*{name}.csv")) for name in ("sr300_hinge", "target_ir"))
+    answer = run("calibrate", "hand-eye", camera, "--poses", arm, "--out", tmp_path / "scene.yaml")
+    assert answer.code == 0
+    assert re.search(r"time offset +-1[67]\.\d ± \d\.\d ms", answer.out)
+    written = Workspace.load(tmp_path / "scene.yaml")
+    assert written.T_world_base is not None
+    assert written.joint_offsets is None
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("{images}",), "--joints, --poses"),
+        (("{images}", "--board", "charuco:10x14"), "board"),
+        (("{images}", "--board", "charuco:3x3:0.07:0.04:7X7_50"), "board"),
+        (("{images}", "--board", BOARD, "--robot", "panda", "--link", "9"), "--link"),
+        (("{images}", "--board", BOARD, "--robot", "nobody"), "nobody"),
+        (("{images}", "--board", BOARD, "--offsets", "yes"), "--offsets"),
+        (("{images}", "--board", BOARD, "--poses", "x.txt"), "--joints, --poses"),
+        (("{images}", "--board", BOARD, "--max-views", "0"), "--max-views"),
+        (("{images}", "--board", BOARD, "--max-views", "4"), "views"),
+        (("{empty}", "--board", BOARD), "empty"),
+        (("nowhere", "--board", BOARD), "nowhere"),
+        (("nowhere.txt", "--poses", "x.txt"), "nowhere.txt"),
+    ],
+)
+def test_wrong_input_of_hand_eye_is_named_and_no_scene_is_written(
+    run: RunCommand, tmp_path: Path, data_root: Path, words: tuple[str, ...], message: str
+) -> None:
+    (tmp_path / "empty").mkdir()
+    places = {"{images}": str(data_root / "panda_charuco_32"), "{empty}": str(tmp_path / "empty")}
+    given = [places.get(word, word) for word in words]
+    answer = run("calibrate", "hand-eye", *given, "--out", tmp_path / "scene.yaml")
+    assert answer.code == 2
+    assert message in answer.err
+    assert "Fix:" in answer.err
+    assert not (tmp_path / "scene.yaml").exists()
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[1, 2",
+        "joint_values: [1, nan]",
+        "joint_values: far",
+        "T_base_link: [[1, 2], [3, 4]]",
+        "- 3",
+        "r_mtx: [1]\nt_vec: [1, 2, 3]",
+    ],
+)
+def test_a_damaged_file_next_to_an_image_is_named(tmp_path: Path, text: str) -> None:
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((8, 8, 3), np.uint8))
+    (tmp_path / "a.yaml").write_text(text)
+    with pytest.raises(FormatError, match=r"a\.yaml"):
+        list(read_views(str(tmp_path), max_views=3))

@@ -42,7 +42,7 @@ LOG = "synthetic:tabletop?width=160&height=120&frames=14"
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run that was not interrupted."""
     out = tmp_path_factory.mktemp("whole")
-    map_log(open_log(LOG), out=out, config=small_config())
+    map_log(open_log(LOG), out=out, config=small_config(), report=False)
     return out
 
 
@@ -50,7 +50,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def half(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run that ended after half of the frames."""
     out = tmp_path_factory.mktemp("half")
-    map_log(open_log(LOG), out=out, config=small_config(), max_frames=7, save_every=0.0)
+    map_log(open_log(LOG), out=out, config=small_config(), max_frames=7, save_every=0.0, report=False)
     return out
 
 
@@ -64,25 +64,27 @@ def copy(half: Path, tmp_path: Path) -> Path:
 def test_a_resumed_run_is_bit_for_bit_the_uninterrupted_one(whole: Path, copy: Path) -> None:
     saved = SavedRun.load(copy)
     assert saved.place.next_index == 7
-    map_log(open_log(LOG), out=copy, resume=saved)
+    map_log(open_log(LOG), out=copy, resume=saved, report=False)
     for name in ("trajectory.tum", "map.ply", "config.yaml"):
         assert (copy / name).read_bytes() == (whole / name).read_bytes(), name
 
 
 def test_a_run_resumed_three_times_is_still_the_same(whole: Path, tmp_path: Path) -> None:
-    map_log(open_log(LOG), out=tmp_path, config=small_config(), max_frames=3, save_every=0.0)
+    map_log(open_log(LOG), out=tmp_path, config=small_config(), max_frames=3, save_every=0.0, report=False)
     for frames in (4, 9, 14):
-        map_log(open_log(LOG), out=tmp_path, resume=SavedRun.load(tmp_path), max_frames=frames, save_every=1e9)
+        map_log(
+            open_log(LOG), out=tmp_path, resume=SavedRun.load(tmp_path), max_frames=frames, save_every=1e9, report=False
+        )
     assert (tmp_path / "trajectory.tum").read_bytes() == (whole / "trajectory.tum").read_bytes()
     assert len(list((tmp_path / "state").iterdir())) == 2
 
 
 def test_a_paced_run_is_resumed_with_its_counts(tmp_path: Path) -> None:
     patient = small_config(tracking__budget_ms=1000.0)  # on a busy machine no stage is skipped for lack of time
-    map_log(open_log(LOG), out=tmp_path, config=patient, max_frames=7, rate=4.0, save_every=0.0)
+    map_log(open_log(LOG), out=tmp_path, config=patient, max_frames=7, rate=4.0, save_every=0.0, report=False)
     saved = SavedRun.load(tmp_path)
     assert saved.config.mapping.threaded
-    result = map_log(open_log(LOG), out=tmp_path, resume=saved, rate=4.0)
+    result = map_log(open_log(LOG), out=tmp_path, resume=saved, rate=4.0, report=False)
     counts = result.metrics
     assert counts["frames"] + counts["dropped"] == 14
     assert counts["lost"] == 0
@@ -90,7 +92,7 @@ def test_a_paced_run_is_resumed_with_its_counts(tmp_path: Path) -> None:
 
 
 def test_saving_does_not_change_the_run(whole: Path, tmp_path: Path) -> None:
-    map_log(open_log(LOG), out=tmp_path, config=small_config(), save_every=0.0)
+    map_log(open_log(LOG), out=tmp_path, config=small_config(), save_every=0.0, report=False)
     assert (tmp_path / "map.ply").read_bytes() == (whole / "map.ply").read_bytes()
 
 
@@ -104,11 +106,13 @@ def test_a_run_that_a_callback_interrupts_is_saved(
             raise KeyboardInterrupt
 
     log, run = open_log(LOG), tmp_path / "run"
-    result = map_log(log, out=run, config=small_config(), rate=rate, save_every=1e9, on_progress=interrupt)
+    result = map_log(
+        log, out=run, config=small_config(), rate=rate, save_every=1e9, on_progress=interrupt, report=False
+    )
     assert result.metrics["interrupted"]
     saved = SavedRun.load(run)
     assert saved.place.next_index == len((run / "frames.jsonl").read_text().splitlines()) >= after
-    resumed = map_log(log, out=run, resume=saved, max_frames=9)
+    resumed = map_log(log, out=run, resume=saved, max_frames=9, report=False)
     assert resumed.metrics["frames"] + resumed.metrics["dropped"] == 9
 
 
@@ -120,7 +124,7 @@ def test_images_are_written_once(tmp_path: Path) -> None:
         if journal is not None and progress.phase == "mapping":
             sizes.append((progress.keyframes, journal.stat().st_size))
 
-    map_log(open_log(LOG), out=tmp_path, config=small_config(), save_every=0.0, on_progress=watch)
+    map_log(open_log(LOG), out=tmp_path, config=small_config(), save_every=0.0, on_progress=watch, report=False)
     (few, small), (many, large) = sizes[0], sizes[-1]
     assert many > few
     assert large < 1.5 * small * many / few
@@ -147,7 +151,7 @@ def test_the_world_stays_the_maps_when_a_log_is_only_localised(copy: Path, tmp_p
 
 
 def test_a_localised_log_says_in_which_map(copy: Path, tmp_path: Path) -> None:
-    result = map_log(open_log(LOG), out=tmp_path / "again", localise=SavedRun.load(copy), max_frames=5)
+    result = map_log(open_log(LOG), out=tmp_path / "again", localise=SavedRun.load(copy), max_frames=5, report=False)
     assert result.metrics["localised_in"] == str(copy.resolve())
     assert result.metrics["keyframes"] == 0
     assert result.metrics["ate_rmse_m"] < 2e-3
@@ -201,7 +205,7 @@ def test_a_folder_without_a_state_says_how_to_get_one(tmp_path: Path) -> None:
 )
 def test_another_log_than_the_one_begun_with_is_refused(copy: Path, uri: str, what: str) -> None:
     with pytest.raises(LogError, match=what):
-        map_log(open_log(uri), out=copy, resume=SavedRun.load(copy))
+        map_log(open_log(uri), out=copy, resume=SavedRun.load(copy), report=False)
 
 
 @pytest.mark.parametrize(
@@ -319,13 +323,13 @@ def test_a_run_that_version_0_1_saved_is_resumed_and_localized_in_with_one_warni
     assert len(saved.slam.keyframes) == 2
     assert saved.slam._mapper.version > 0
     assert saved.slam._location.keyframe == 1
-    localized = map_log(log, out=tmp_path / "localized", localise=saved)
+    localized = map_log(log, out=tmp_path / "localized", localise=saved, report=False)
     assert localized.metrics["lost"] <= 1  # the first frame, which a second has to confirm
     assert localized.metrics["ate_rmse_m"] < 2e-3
     with pytest.warns(DeprecatedNameWarning):
         saved = SavedRun.load(tmp_path / "run")
     longer = open_log("synthetic:tabletop?frames=12&width=64&height=48")
-    resumed = map_log(longer, out=tmp_path / "run", resume=saved, save_every=0.0)
+    resumed = map_log(longer, out=tmp_path / "run", resume=saved, save_every=0.0, report=False)
     assert resumed.metrics["frames"] == 12
     assert resumed.metrics["lost"] == 0
     assert resumed.metrics["ate_rmse_m"] < 2e-3

@@ -1,0 +1,280 @@
+"""Hand-eye calibration: camera, target and joint offsets of an arm by least squares.
+
+A camera on a link sees a static target, or a static camera sees a target on a link. The moving frame is the one on the
+link, the static frame the one in the base. X is the pose of the moving frame on the link, and Y that of the static
+frame in the base. With the pose F_k of the link and the measured pose C_k of the moving frame in the static one,
+
+    F(q_k + δ) X = Y C_k.
+
+The closed form of Park and Martin (1994) gives the start. Least squares over all views follow, on reprojection errors
+of a board or on errors of tracked poses, with Huber's loss. Weak priors hold joint offsets that the motion does not
+determine; their standard deviation shows it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from splatbot.calibration.estimate import Estimate
+from splatbot.calibration.link_motion import LinkMotion
+from splatbot.calibration.measurements import Measurement
+from splatbot.errors import InputError
+from splatbot.geometry import inverse, se3_exp
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class HandEyeConstants:
+    """Constants of the hand-eye calibration."""
+
+    offset_prior: float = 0.05
+    """Standard deviation [rad or m] of the prior of a joint offset. Larger ones hold undetermined offsets less."""
+    delay_prior: float = 1.0
+    """Standard deviation [s] of the prior of the time offset, around the one of the cross-correlation."""
+    largest_offset_sigma: float = 0.005
+    """Largest standard deviation [rad or m] of a useful joint offset: that of a person's own adjustment."""
+    largest_delay_sigma: float = 0.005
+    """Largest standard deviation [s] of a useful time offset."""
+    huber: float = 1.0
+    """Error [1], in standard deviations, from which Huber's loss is linear. Errors of an arm are not Gaussian."""
+    steps: int = 60
+    """Largest number of steps of one solution [1]. Views that determine the unknowns take 10 to 30."""
+    rounds: int = 4
+    """Number of solutions [1] with standard deviations from the errors of the one before; they change by less than 1 %
+    after three."""
+    blocks: int = 40
+    """Largest number of blocks of neighbouring views [1] that are held out together or left out by the jackknife."""
+    least_turn: float = 0.02
+    """Least second-largest spread of the rotations of the link [rad]; below, all of them are about one axis."""
+    held_out_every: int = 3
+    """Every how many blocks one is held out [1] to compare the models."""
+
+
+CONSTANTS = HandEyeConstants()
+UNKNOWABLE = ("it turns the base, whose pose is unknown too", "it turns the hand, on which the pose is unknown too")
+"""Why no views determine the offsets of the first joint and of the last one before the link."""
+MIN_VIEWS = 6
+"""Least number of views [1]: three motions determine X, and held-out views need as many again."""
+_LOSS: dict[str, Any] = {"loss": "huber", "f_scale": CONSTANTS.huber, "x_scale": "jac", "max_nfev": CONSTANTS.steps}
+
+
+@dataclass(frozen=True, eq=False)
+class HandEyeCalibration:
+    """Estimated poses, offsets and their standard deviations.
+
+    Args:
+        T_link_moving: (4, 4) pose X on the link: of the camera, or of a board in front of a static camera [m].
+        T_base_static: (4, 4) pose Y in the base: of the board or the map, or of a static camera [m].
+        sigma_moving, sigma_static: (6,) standard deviations of their translation [m] and rotation [rad].
+        offsets: offset of each joint [rad or m], to be added to its measured position; empty if none is estimated.
+        delay: time offset [s]: the link was at the pose of a view this time after the view's stamp.
+        error: median error over all views in ``unit``.
+        held_out: median error of held-out views without joint offsets and, if they are estimated, with them.
+        unit: unit of the errors.
+        views: number of views.
+    """
+
+    T_link_moving: Array
+    T_base_static: Array
+    sigma_moving: Array
+    sigma_static: Array
+    offsets: dict[str, Estimate]
+    delay: Estimate | None
+    error: float
+    held_out: tuple[float, ...]
+    unit: str
+    views: int
+
+    @property
+    def joint_offsets(self) -> Array:
+        """Offsets (J,) of all joints [rad or m], 0 where the views do not determine one."""
+        return np.array([0.0 if e.refusal else e.value for e in self.offsets.values()])
+
+
+def calibrate_hand_eye(
+    motion: LinkMotion, measured: Measurement, *, offsets: bool | None = None, delay: float | None = None
+) -> HandEyeCalibration:
+    """Estimate the poses X and Y, and optionally joint offsets and a time offset.
+
+    Every third view is held out to compare the models with and without joint offsets. All views give the result.
+
+    Args:
+        motion: poses of the link, one for each view.
+        measured: measured poses, one for each view.
+        offsets: whether joint offsets are estimated. If None, they are if this lowers the held-out error by a tenth.
+        delay: time offset [s] that the stamps of the motion already lack; a correction is estimated. If None, both have
+            one clock.
+
+    Raises:
+        InputError: there are fewer than 6 views, or the link turns about one axis only.
+    """
+    if len(motion) < MIN_VIEWS:
+        raise InputError(f"has {len(motion)} usable views.", field="views", hint=f"give {MIN_VIEWS} or more")
+    choices = [False] if not motion.offsets else [False, True] if offsets is None else [False, True][: 1 + offsets]
+    held_out = [_held_out_error(motion, measured, choice, delay) for choice in choices]
+    use = len(choices) == 2 and (offsets is True or held_out[1] < 0.9 * held_out[0])
+    model = _Model(motion, measured, use, delay)
+    solution = model.solve()
+    return model.result(solution, tuple(held_out))
+
+
+def _held_out_error(motion: LinkMotion, measured: Measurement, offsets: bool, delay: float | None) -> float:
+    """Return the median error of every third block of views of a fit to the others."""
+    rows = np.arange(len(motion))
+    blocks = np.array_split(rows, min(len(rows), CONSTANTS.blocks))
+    out = np.isin(rows, np.concatenate(blocks[:: CONSTANTS.held_out_every]))
+    fitted = _Model(motion.select(rows[~out]), measured.select(rows[~out]), offsets, delay)
+    solution = fitted.solve()
+    test = _Model(motion.select(rows[out]), measured.select(rows[out]), offsets, delay, start=(fitted.X, fitted.Y))
+    return test.measured.error(test.measured.residuals(test.predict(solution)))
+
+
+class _Model:
+    """Least squares of one set of views.
+
+    The unknowns x are the twists of X and Y around their start, the joint offsets and the time offset.
+    """
+
+    def __init__(
+        self,
+        motion: LinkMotion,
+        measured: Measurement,
+        offsets: bool,
+        delay: float | None,
+        start: tuple[Array, Array] | None = None,
+    ) -> None:
+        self.motion, self.measured, self.delay = motion, measured, delay
+        self.names = motion.offsets[1:-1] if offsets else ()  # see UNKNOWABLE
+        F = motion.poses(np.zeros(len(motion.offsets)), 0.0)
+        self.X, self.Y = closed_form(F, measured.start) if start is None else start
+        sigmas = [np.inf] * 12 + [CONSTANTS.offset_prior] * len(self.names)
+        self.prior = 1.0 / np.array(sigmas + [CONSTANTS.delay_prior] * (delay is not None))
+
+    def predict(self, x: Array) -> Array:
+        """Compute the poses Y⁻¹ F X (V, 4, 4)."""
+        offsets = np.zeros(len(self.motion.offsets))
+        offsets[1 : 1 + len(self.names)] = x[12 : 12 + len(self.names)]
+        F = self.motion.poses(offsets, 0.0 if self.delay is None else float(x[-1]))
+        return np.asarray(inverse(self.Y @ se3_exp(x[6:12])) @ F @ (self.X @ se3_exp(x[:6])))
+
+    def solve(self) -> Array:
+        """Return the solution; the standard deviations of the measurement follow its errors."""
+        x = np.zeros(len(self.prior))
+        for _ in range(CONSTANTS.rounds):
+            before, x = x, np.asarray(least_squares(self._residuals, x, **_LOSS).x)
+            self.measured = self.measured.scaled(self.measured.residuals(self.predict(x)))
+            if np.abs(x - before).max() < 1e-7:
+                break
+        return x
+
+    def _residuals(self, x: Array) -> Array:
+        return np.concatenate([*self.measured.residuals(self.predict(x)), self.prior * x])
+
+    def covariance(self, x: Array) -> Array:
+        """Compute the covariance of the unknowns, of noise and prior and of the jackknife over blocks of views.
+
+        The errors of one view are not independent, because the arm and the tracking err for the whole view. The
+        delete-one-block jackknife (Efron 1982), linearized at the solution, needs no model of them:
+        (B - 1)/B Σ d_b d_bᵀ with d_b = (H - H_b)⁻¹ g_b.
+        """
+        sizes = [len(r) for r in self.measured.residuals(self.predict(x))]
+        found = least_squares(self._residuals, x, max_nfev=1)
+        weights = np.sqrt(np.minimum(1.0, CONSTANTS.huber / np.maximum(np.abs(found.fun), 1e-300)))
+        J, r = found.jac * weights[:, None], found.fun * weights
+        H = J.T @ J
+        edges = np.concatenate([[0], np.cumsum(sizes)])
+        blocks = np.array_split(np.arange(len(sizes)), min(len(sizes), CONSTANTS.blocks))
+        count, steps = len(blocks), []
+        for views in blocks:
+            rows = slice(edges[views[0]], edges[views[-1] + 1])
+            steps.append(np.linalg.pinv(H - J[rows].T @ J[rows], hermitian=True) @ (J[rows].T @ r[rows]))
+        return np.asarray(
+            np.linalg.pinv(H, hermitian=True) + (count - 1) / count * np.transpose(steps) @ np.array(steps)
+        )
+
+    def result(self, x: Array, held_out: tuple[float, ...]) -> HandEyeCalibration:
+        """Return the calibration of a solution."""
+        sigma = np.sqrt(np.diag(self.covariance(x)))
+        need = "move the other joints more, or this one with the camera close to the target"
+        limit = CONSTANTS.largest_offset_sigma
+        offsets = {
+            name: Estimate.limited(float(x[12 + k]), float(sigma[12 + k]), "rad", limit, need)
+            for k, name in enumerate(self.names)
+        }
+        if self.names:
+            ends = [Estimate(0.0, CONSTANTS.offset_prior, "rad", reason) for reason in UNKNOWABLE]
+            offsets = {self.motion.offsets[0]: ends[0], **offsets, self.motion.offsets[-1]: ends[1]}
+        delay = None
+        if self.delay is not None:
+            need = "move faster and in all directions"
+            value = self.delay + float(x[-1])
+            delay = Estimate.limited(value, float(sigma[-1]), "s", CONSTANTS.largest_delay_sigma, need)
+        return HandEyeCalibration(
+            self.X @ se3_exp(x[:6]),
+            self.Y @ se3_exp(x[6:12]),
+            sigma[:6],
+            sigma[6:12],
+            offsets,
+            delay,
+            self.measured.error(self.measured.residuals(self.predict(x))),
+            held_out,
+            self.measured.unit,
+            len(self.motion),
+        )
+
+
+def closed_form(T_base_link: Array, T_static_moving: Array) -> tuple[Array, Array]:
+    """Compute X and Y of F_k X = Y C_k (Park and Martin, Robot sensor calibration: solving AX = XB, 1994).
+
+    Pairs of views give A X = X B with A = F_i⁻¹ F_j and B = C_i⁻¹ C_j. The rotation of X turns the rotation vectors of
+    B into those of A (orthogonal Procrustes). Its translation solves (R_A - I) t_X = R_X t_B - t_A.
+
+    Args:
+        T_base_link: (V, 4, 4) poses F.
+        T_static_moving: (V, 4, 4) poses C.
+
+    Raises:
+        InputError: the rotations of the link are about one axis only.
+    """
+    V = len(T_base_link)
+    i, j = np.triu_indices(V, 1)
+    if len(i) > 4000:  # enough to average the noise; all pairs of a long log need gigabytes
+        chosen = np.random.default_rng(0).choice(len(i), 4000, replace=False)
+        i, j = i[chosen], j[chosen]
+    A, B = _relative(T_base_link, i, j), _relative(T_static_moving, i, j)
+    alpha, beta = (Rotation.from_matrix(M[:, :3, :3]).as_rotvec() for M in (A, B))
+    safe = np.linalg.norm(alpha, axis=1) < 3.0  # near π the axis may point either way
+    spread = np.linalg.svd(alpha[safe], compute_uv=False) / np.sqrt(max(1, int(safe.sum())))
+    if len(spread) < 2 or spread[1] < CONSTANTS.least_turn:
+        turn = 0.0 if len(spread) < 2 else np.degrees(spread[1])
+        raise InputError(
+            f"turns about one axis only: {turn:.1f} degrees about others.",
+            field="motion",
+            hint="turn the link about two axes or more between the views, by 20 degrees or more",
+        )
+    U, _, Vt = np.linalg.svd(alpha[safe].T @ beta[safe])
+    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    left = (A[:, :3, :3] - np.eye(3)).reshape(-1, 3)
+    right = (B[:, :3, 3] @ R.T - A[:, :3, 3]).reshape(-1)
+    X, Y = np.eye(4), np.eye(4)
+    X[:3, :3], X[:3, 3] = R, np.linalg.lstsq(left, right, rcond=None)[0]
+    found = T_base_link @ X @ np.stack([inverse(T) for T in T_static_moving])
+    U, _, Vt = np.linalg.svd(found[:, :3, :3].sum(axis=0))
+    Y[:3, :3], Y[:3, 3] = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt, np.median(found[:, :3, 3], axis=0)
+    return X, Y
+
+
+def _relative(T: Array, i: NDArray[np.intp], j: NDArray[np.intp]) -> Array:
+    """Compute T_i⁻¹ T_j (P, 4, 4) of rigid transforms."""
+    out = np.tile(np.eye(4), (len(i), 1, 1))
+    R = T[i, :3, :3].transpose(0, 2, 1)
+    out[:, :3, :3] = R @ T[j, :3, :3]
+    out[:, :3, 3] = np.einsum("nij,nj->ni", R, T[j, :3, 3] - T[i, :3, 3])
+    return out

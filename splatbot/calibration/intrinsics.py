@@ -1,0 +1,92 @@
+"""Intrinsics of a camera from views of a board (Zhang, A flexible new technique for camera calibration, 2000)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from splatbot.calibration.board import MIN_CORNERS, BoardView
+from splatbot.calibration.estimate import Estimate
+from splatbot.camera import Camera
+from splatbot.errors import InputError
+
+Array = NDArray[np.float64]
+
+MIN_VIEWS = 6
+"""Least number of views [1]: of fewer, one bad view changes the focal length by percents."""
+_LARGEST = {"fx": 0.01, "fy": 0.01, "cx": 0.01, "cy": 0.01}  # [1] standard deviation over the width of the image
+
+
+@dataclass(frozen=True, eq=False)
+class IntrinsicsCalibration:
+    """Estimated camera.
+
+    Args:
+        camera: camera with OpenCV's distortion (k1, k2, p1, p2, k3).
+        estimates: each value with its standard deviation.
+        rms: root mean square of the reprojection errors [px].
+        views: root mean square of each view [px].
+        corners: number of corners.
+    """
+
+    camera: Camera
+    estimates: dict[str, Estimate]
+    rms: float
+    views: Array
+    corners: int
+
+
+def calibrate_intrinsics(views: Sequence[BoardView], size: tuple[int, int]) -> IntrinsicsCalibration:
+    """Estimate focal lengths, principal point and distortion by least squares of the reprojection errors.
+
+    A standard deviation is that of the least squares. Half the difference of the fits to the odd and to the even views
+    replaces it if this is larger. Where the views do not determine a value, that of the least squares is meaningless.
+
+    Args:
+        views: views of one board; those with fewer than 8 corners are left out.
+        size: width and height of the images [px].
+
+    Raises:
+        InputError: fewer than 6 views show the board, or they do not determine the camera.
+    """
+    chosen = [view for view in views if len(view) >= MIN_CORNERS]
+    if len(chosen) < MIN_VIEWS:
+        raise InputError(
+            f"{len(chosen)} of {len(views)} images show {MIN_CORNERS} corners of the board or more.",
+            field="views",
+            hint=f"take {MIN_VIEWS} images or more, 20 from different sides and distances are usual",
+        )
+    rms, values, sigma, errors = _fit(chosen, size)
+    halves = [_fit(chosen[k::2], size)[1] for k in (0, 1)]
+    sigma = np.maximum(sigma, 0.5 * np.abs(halves[0] - halves[1]))
+    names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+    need = "tilt the board more against the image, and fill the corners of the image"
+    estimates = {
+        name: Estimate.limited(float(v), float(s), "px" if name in _LARGEST else "", _limit(name, size), need)
+        for name, v, s in zip(names, values, sigma, strict=True)
+    }
+    fx, fy, cx, cy, *distortion = (float(value) for value in values)
+    camera = Camera(fx, fy, cx, cy, *size, tuple(distortion))
+    return IntrinsicsCalibration(camera, estimates, rms, errors, sum(map(len, chosen)))
+
+
+def _fit(views: Sequence[BoardView], size: tuple[int, int]) -> tuple[float, Array, Array, Array]:
+    """Return the RMS error [px], the values (9,), their standard deviations (9,) and the RMS error of each view."""
+    points = [view.points.astype(np.float32) for view in views]
+    pixels = [view.pixels.astype(np.float32) for view in views]
+    try:
+        rms, K, D, _, _, sigma, _, errors = cv2.calibrateCameraExtended(points, pixels, size, None, None)  # type: ignore[call-overload]
+    except cv2.error as error:
+        raise InputError(
+            f"do not determine the camera ({error.err}).", field="views", hint="tilt the board against the image"
+        ) from error
+    values = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *np.reshape(D, -1)[:5]])
+    return float(rms), values, np.reshape(sigma, -1)[:9].astype(np.float64), np.reshape(errors, -1)
+
+
+def _limit(name: str, size: tuple[int, int]) -> float:
+    return _LARGEST[name] * size[0] if name in _LARGEST else np.inf

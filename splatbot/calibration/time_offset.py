@@ -1,0 +1,68 @@
+"""Time offset between two recordings of one rigid motion."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import correlate, correlation_lags
+from scipy.spatial.transform import Rotation, Slerp
+
+from splatbot.errors import InputError
+
+Array = NDArray[np.float64]
+
+_STEP = 0.005  # [s] of the grid on which speeds are compared; the peak is interpolated between its points
+_WINDOW = 0.1  # [s] over which a speed is the mean, or two samples: the noise of poses at 100 Hz hides slow motion
+_MIN_OVERLAP = 0.3  # [1] of the shorter recording
+_MAX_SAMPLES = 2_000_000  # of a recording on the grid: 2.8 hours
+_LEAST_CORRELATION = 0.5  # [1] of a peak that can be trusted as a start
+
+
+def cross_correlate(stamps_a: Array, T_a: Array, stamps_b: Array, T_b: Array) -> float:
+    """Compute the delay [s] with which angular speeds agree best: |ω_b(t)| = |ω_a(t + delay)|.
+
+    Angular speeds of two frames on one rigid body are equal for any poses of these frames. The normalized
+    cross-correlation of both speeds has its peak at the delay; a parabola through its top interpolates it.
+
+    Args:
+        stamps_a, stamps_b: (N,), (M,) increasing times [s], possibly of clocks with different zeros.
+        T_a, T_b: (N, 4, 4), (M, 4, 4) poses of the two frames.
+
+    Raises:
+        InputError: a recording is too short or too long, or the speeds do not agree anywhere.
+    """
+    window = max(_WINDOW, *(2.0 * float(np.median(np.diff(stamps))) for stamps in (stamps_a, stamps_b)))
+    starts, speeds = zip(*(_angular_speed(t, T, window) for t, T in ((stamps_a, T_a), (stamps_b, T_b))), strict=True)
+    a, b = (speed - speed.mean() for speed in speeds)
+    lags = correlation_lags(len(a), len(b))
+    ones = np.ones(len(a)), np.ones(len(b))
+    overlap = np.rint(correlate(*ones))
+    energy = np.maximum(correlate(a**2, ones[1]), 0.0) * np.maximum(correlate(ones[0], b**2), 0.0)
+    enough = overlap >= _MIN_OVERLAP * min(len(a), len(b))
+    score = np.where(enough, correlate(a, b) / np.sqrt(np.maximum(energy, 1e-12 * energy.max() + 1e-300)), -1.0)
+    best = int(np.argmax(score))
+    if not score[best] > _LEAST_CORRELATION:
+        raise InputError(
+            f"do not agree: their angular speeds correlate by {score[best]:.2f} at most.",
+            field="recordings",
+            hint="give two recordings of one motion that turns, both at 5 Hz or more",
+        )
+    shift = 0.0
+    if 0 < best < len(score) - 1 and enough[best - 1] and enough[best + 1]:
+        left, top, right = score[best - 1 : best + 2]
+        shift = 0.5 * (left - right) / min(left - 2 * top + right, -1e-300)
+    return float(starts[0] - starts[1] + _STEP * (lags[best] + shift))
+
+
+def _angular_speed(stamps: Array, T: Array, window: float) -> tuple[float, Array]:
+    """Return the first time [s] and the mean angular speeds [rad/s] over ``window`` [s] on a grid."""
+    if len(stamps) < 20:
+        raise InputError(f"has {len(stamps)} poses.", field="recordings", hint="give 20 poses or more")
+    duration = float(stamps[-1] - stamps[0])
+    if duration > _STEP * _MAX_SAMPLES:
+        raise InputError(f"lasts {duration:.0f} s.", field="recordings", hint="give a part of it; a minute is enough")
+    times = np.arange(stamps[0] + 0.5 * window, stamps[-1] - 0.5 * window, _STEP)
+    turns = Slerp(stamps, Rotation.from_matrix(T[:, :3, :3]))
+    before, after = (turns(np.clip(times + k * window, stamps[0], stamps[-1])) for k in (-0.5, 0.5))
+    speed = (before.inv() * after).magnitude() / window
+    return float(times[0]), np.asarray(speed)

@@ -1,0 +1,85 @@
+"""Time offsets: recovered between clocks with different zeros, refused for unrelated motions."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from splatbot.calibration.hand_eye import calibrate_hand_eye
+from splatbot.calibration.streams import align_streams, load_stream
+from splatbot.calibration.time_offset import cross_correlate
+from splatbot.errors import InputError
+from splatbot.geometry import se3_exp
+
+Array = NDArray[np.float64]
+
+
+def motion(times: Array, seed: int = 0) -> Array:
+    rng = np.random.default_rng(seed)
+    rates, phases = rng.uniform(0.3, 2.0, 6), rng.uniform(0, 6, 6)
+    return np.stack([se3_exp(0.5 * np.sin(rates * t + phases)) for t in times])
+
+
+@pytest.mark.parametrize(("delay", "epoch"), [(0.0, 0.0), (0.137, 0.0), (-2.5, 0.0), (0.0213, 1.5e9), (-40.0, 1e6)])
+def test_the_delay_of_two_frames_of_one_body_is_recovered_to_two_milliseconds(delay: float, epoch: float) -> None:
+    X, Y = se3_exp([0.1, 0.2, -0.1, 0.5, 1.0, -0.3]), se3_exp([1.0, 0, 2.0, -1.0, 0.2, 0.4])
+    a, b = np.arange(0, 40, 0.01), np.arange(3.0, 33.0, 1 / 30)
+    T_b = Y @ motion(b) @ X
+    rng = np.random.default_rng(1)
+    T_b = np.array([T @ se3_exp(rng.normal(0, 0.002, 6)) for T in T_b])
+    found = cross_correlate(epoch + a + delay, motion(a), b, T_b)
+    assert found - epoch == pytest.approx(delay, abs=0.002)
+
+
+def test_motions_that_are_unrelated_or_at_rest_are_refused() -> None:
+    t = np.arange(0, 30, 0.02)
+    rest = np.tile(np.eye(4), (len(t), 1, 1))
+    for other in (motion(t, 2), motion(t, 3), rest):
+        with pytest.raises(InputError, match="do not agree"):
+            cross_correlate(t, motion(t, 0), t, other)
+
+
+def test_short_and_endless_recordings_are_refused() -> None:
+    t = np.arange(0, 30, 0.02)
+    with pytest.raises(InputError, match="has 5 poses"):
+        cross_correlate(t, motion(t), t[:5], motion(t[:5]))
+    with pytest.raises(InputError, match="lasts"):
+        cross_correlate(t * 1e6, motion(t), t, motion(t))
+
+
+@pytest.mark.parametrize(
+    ("name", "arm", "camera"),
+    [
+        ("robot_arm_w_color_camera_sim", "robot_arm_sim_hand", "robot_arm_sim_camera"),
+        ("robot_arm_w_color_camera_real", "sr300_hinge", "target_ir"),
+    ],
+)
+def test_least_squares_and_cross_correlation_agree_to_five_milliseconds_on_recordings(
+    data_root: Path, tmp_path: Path, name: str, arm: str, camera: str
+) -> None:
+    with zipfile.ZipFile(data_root / "hand_eye_time_offset" / f"{name}.zip") as archive:
+        archive.extractall(tmp_path)
+    (arm_file,) = (p for p in tmp_path.rglob(f"*{arm}.csv") if "merged_" not in p.name)
+    (camera_file,) = (p for p in tmp_path.rglob(f"*{camera}.csv") if "merged_" not in p.name)
+    tracked, record = load_stream(camera_file), load_stream(arm_file)
+    moved, measured, start = align_streams(tracked, record.stamps, T_base_link=record.T_world_camera)
+    assert start is not None
+    found = calibrate_hand_eye(moved, measured, delay=start)
+    assert found.delay is not None
+    assert found.delay.value == pytest.approx(start, abs=0.005)
+
+
+def test_slow_recordings_are_matched_by_equal_stamps_alone() -> None:
+    from splatbot.trajectory import Trajectory
+
+    t = np.arange(20.0)
+    tracked = Trajectory(t[2:15], motion(t[2:15]))
+    moved, measured, delay = align_streams(tracked, t, T_base_link=motion(t))
+    assert delay is None
+    assert len(moved) == len(measured.T_static_moving) == 13
+    with pytest.raises(InputError, match="do not overlap"):
+        align_streams(Trajectory(t + 0.5, motion(t)), t, T_base_link=motion(t))
