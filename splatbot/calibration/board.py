@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -94,26 +93,30 @@ class CharucoBoard:
             raise InputError(f"is {text!r}.", field="board", hint=f"write {_SPEC}")
         return cls(columns, rows, square, marker, rest[0].upper().removeprefix("DICT_") if rest else "", legacy)
 
-    def completed(self, images: Iterable[NDArray[np.uint8]]) -> CharucoBoard:
-        """Return the board with the dictionary and the pattern of which the first images show most corners.
+    @property
+    def complete(self) -> bool:
+        """Return whether dictionary and pattern are known."""
+        return bool(self.dictionary) and self.legacy is not None
+
+    def completed(self, image: NDArray[np.uint8]) -> CharucoBoard:
+        """Return the board with the dictionary and the pattern of which an image shows most corners.
 
         Raises:
-            InputError: no image shows a marker of a dictionary that has enough markers for the board.
+            InputError: the image shows fewer than 8 corners in any of them.
         """
-        if self.dictionary and self.legacy is not None:
+        if self.complete:
             return self
         needed = self.columns * self.rows // 2
         names = (self.dictionary,) if self.dictionary else dictionaries()
         patterns = (False, True) if self.legacy is None else (self.legacy,)
-        for image in images:
-            markers = {name: self._markers(image, name, needed) for name in names}
-            best = max(names, key=lambda name: markers[name])
-            boards = [replace(self, dictionary=best, legacy=legacy) for legacy in patterns]
-            corners = [len(board.detect(image)) for board in boards] if markers[best] else [0]
-            if max(corners) >= MIN_CORNERS:
-                return boards[int(np.argmax(corners))]
+        markers = {name: self._markers(image, name, needed) for name in names}
+        best = max(names, key=lambda name: markers[name])
+        boards = [replace(self, dictionary=best, legacy=legacy) for legacy in patterns]
+        corners = [len(board.detect(image)) for board in boards] if markers[best] else [0]
+        if max(corners) >= MIN_CORNERS:
+            return boards[int(np.argmax(corners))]
         raise InputError(
-            f"is in no image: none shows {MIN_CORNERS} of its corners.",
+            f"is not in the image: it shows fewer than {MIN_CORNERS} of its corners.",
             field="board",
             hint="check the numbers of squares and the images, or name the dictionary (4X4_50, 5X5_1000, ...)",
         )

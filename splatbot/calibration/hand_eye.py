@@ -34,6 +34,8 @@ Array = NDArray[np.float64]
 class HandEyeConstants:
     """Constants of the hand-eye calibration."""
 
+    pose_prior: float = 10.0
+    """Standard deviation [m and rad] of the prior of X and Y around the closed form: none for any arm in a room."""
     offset_prior: float = 0.05
     """Standard deviation [rad or m] of the prior of a joint offset. Larger ones hold undetermined offsets less."""
     delay_prior: float = 1.0
@@ -42,6 +44,8 @@ class HandEyeConstants:
     """Largest standard deviation [rad or m] of a useful joint offset: that of a person's own adjustment."""
     largest_delay_sigma: float = 0.005
     """Largest standard deviation [s] of a useful time offset."""
+    largest_pose_sigma: tuple[float, float] = (0.02, 0.035)
+    """Largest standard deviations of useful poses: of a coordinate [m], and of a rotation [rad], 2 degrees."""
     huber: float = 1.0
     """Error [1], in standard deviations, from which Huber's loss is linear. Errors of an arm are not Gaussian."""
     steps: int = 60
@@ -93,6 +97,14 @@ class HandEyeCalibration:
     views: int
 
     @property
+    def refusal(self) -> str:
+        """Reason why the pose on the link is of no use, empty if it is."""
+        shift, turn = float(self.sigma_moving[:3].max()), float(self.sigma_moving[3:].max())
+        if shift <= CONSTANTS.largest_pose_sigma[0] and turn <= CONSTANTS.largest_pose_sigma[1]:
+            return ""
+        return f"its standard deviation is up to {1e3 * shift:.0f} mm and {np.degrees(turn):.1f} degrees"
+
+    @property
     def joint_offsets(self) -> Array:
         """Offsets (J,) of all joints [rad or m], 0 where the views do not determine one."""
         return np.array([0.0 if e.refusal else e.value for e in self.offsets.values()])
@@ -120,9 +132,22 @@ def calibrate_hand_eye(
     choices = [False] if not motion.offsets else [False, True] if offsets is None else [False, True][: 1 + offsets]
     held_out = [_held_out_error(motion, measured, choice, delay) for choice in choices]
     use = len(choices) == 2 and (offsets is True or held_out[1] < 0.9 * held_out[0])
-    model = _Model(motion, measured, use, delay)
-    solution = model.solve()
-    return model.result(solution, tuple(held_out))
+    free, refused = _free_offsets(motion, use), dict[str, Estimate]()
+    while True:
+        model = _Model(motion, measured, free, delay)
+        found = model.result(model.solve(), tuple(held_out), refused)
+        weak = {name: e for name, e in found.offsets.items() if name in free and e.refusal}
+        if not weak:
+            return found
+        # Offsets may trade off: without the least certain one, the others may be determined.
+        least = max(weak, key=lambda name: weak[name].sigma)
+        refused[least] = weak[least]
+        free = tuple(name for name in free if name != least)
+
+
+def _free_offsets(motion: LinkMotion, wanted: bool) -> tuple[str, ...]:
+    """Return the joints whose offsets views can determine; see :data:`UNKNOWABLE`."""
+    return motion.offsets[1:-1] if wanted else ()
 
 
 def _held_out_error(motion: LinkMotion, measured: Measurement, offsets: bool, delay: float | None) -> float:
@@ -130,9 +155,10 @@ def _held_out_error(motion: LinkMotion, measured: Measurement, offsets: bool, de
     rows = np.arange(len(motion))
     blocks = np.array_split(rows, min(len(rows), CONSTANTS.blocks))
     out = np.isin(rows, np.concatenate(blocks[:: CONSTANTS.held_out_every]))
-    fitted = _Model(motion.select(rows[~out]), measured.select(rows[~out]), offsets, delay)
+    free = _free_offsets(motion, offsets)
+    fitted = _Model(motion.select(rows[~out]), measured.select(rows[~out]), free, delay)
     solution = fitted.solve()
-    test = _Model(motion.select(rows[out]), measured.select(rows[out]), offsets, delay, start=(fitted.X, fitted.Y))
+    test = _Model(motion.select(rows[out]), measured.select(rows[out]), free, delay, start=(fitted.X, fitted.Y))
     return test.measured.error(test.measured.residuals(test.predict(solution)))
 
 
@@ -146,21 +172,21 @@ class _Model:
         self,
         motion: LinkMotion,
         measured: Measurement,
-        offsets: bool,
+        names: tuple[str, ...],
         delay: float | None,
         start: tuple[Array, Array] | None = None,
     ) -> None:
         self.motion, self.measured, self.delay = motion, measured, delay
-        self.names = motion.offsets[1:-1] if offsets else ()  # see UNKNOWABLE
+        self.names, self.joints = names, [motion.offsets.index(name) for name in names]
         F = motion.poses(np.zeros(len(motion.offsets)), 0.0)
         self.X, self.Y = closed_form(F, measured.start) if start is None else start
-        sigmas = [np.inf] * 12 + [CONSTANTS.offset_prior] * len(self.names)
+        sigmas = [CONSTANTS.pose_prior] * 12 + [CONSTANTS.offset_prior] * len(self.names)
         self.prior = 1.0 / np.array(sigmas + [CONSTANTS.delay_prior] * (delay is not None))
 
     def predict(self, x: Array) -> Array:
         """Compute the poses Y⁻¹ F X (V, 4, 4)."""
         offsets = np.zeros(len(self.motion.offsets))
-        offsets[1 : 1 + len(self.names)] = x[12 : 12 + len(self.names)]
+        offsets[self.joints] = x[12 : 12 + len(self.names)]
         F = self.motion.poses(offsets, 0.0 if self.delay is None else float(x[-1]))
         return np.asarray(inverse(self.Y @ se3_exp(x[6:12])) @ F @ (self.X @ se3_exp(x[:6])))
 
@@ -194,13 +220,11 @@ class _Model:
         count, steps = len(blocks), []
         for views in blocks:
             rows = slice(edges[views[0]], edges[views[-1] + 1])
-            steps.append(np.linalg.pinv(H - J[rows].T @ J[rows], hermitian=True) @ (J[rows].T @ r[rows]))
-        return np.asarray(
-            np.linalg.pinv(H, hermitian=True) + (count - 1) / count * np.transpose(steps) @ np.array(steps)
-        )
+            steps.append(np.linalg.solve(H - J[rows].T @ J[rows], J[rows].T @ r[rows]))
+        return np.asarray(np.linalg.inv(H) + (count - 1) / count * np.transpose(steps) @ np.array(steps))
 
-    def result(self, x: Array, held_out: tuple[float, ...]) -> HandEyeCalibration:
-        """Return the calibration of a solution."""
+    def result(self, x: Array, held_out: tuple[float, ...], refused: dict[str, Estimate]) -> HandEyeCalibration:
+        """Return the calibration of a solution; ``refused`` offsets are 0 in it."""
         sigma = np.sqrt(np.diag(self.covariance(x)))
         need = "move the other joints more, or this one with the camera close to the target"
         limit = CONSTANTS.largest_offset_sigma
@@ -208,9 +232,11 @@ class _Model:
             name: Estimate.limited(float(x[12 + k]), float(sigma[12 + k]), "rad", limit, need)
             for k, name in enumerate(self.names)
         }
-        if self.names:
+        if offsets or refused:
             ends = [Estimate(0.0, CONSTANTS.offset_prior, "rad", reason) for reason in UNKNOWABLE]
-            offsets = {self.motion.offsets[0]: ends[0], **offsets, self.motion.offsets[-1]: ends[1]}
+            first, *_, last = self.motion.offsets
+            every = {first: ends[0], **offsets, **refused, last: ends[1]}
+            offsets = {name: every[name] for name in self.motion.offsets}
         delay = None
         if self.delay is not None:
             need = "move faster and in all directions"

@@ -23,24 +23,24 @@ _LAYOUT = "`joint_values: [q1, ...]` [rad], or `T_base_link` (4 rows of 4) [m], 
 
 
 @dataclass(frozen=True, eq=False)
-class ImageView:
-    """An image, with the arm at its time.
+class ArmView:
+    """The arm at the time of an image.
 
     Args:
         name: name of the file or number of the frame.
-        image: (H, W, 3) uint8.
         joints: (J,) [rad or m], if known.
         T_base_link: (4, 4) [m], if known.
     """
 
     name: str
-    image: NDArray[np.uint8]
     joints: Array | None = None
     T_base_link: Array | None = None
 
 
-def read_views(source: str, *, max_views: int) -> Iterator[ImageView]:
+def read_views(source: str, *, max_views: int) -> Iterator[tuple[float, ArmView, NDArray[np.uint8]]]:
     """Read the images of a folder or a log one by one, at most ``max_views`` of them, evenly spread.
+
+    Yields the share of the images that are read, the arm, and the image (H, W, 3).
 
     In a folder, a YAML or JSON file of the name of an image holds ``joint_values``, ``T_base_link``, or ``r_mtx`` and
     ``t_vec``. In a log, its frames have the joints of its ``joints.txt`` or of its topics.
@@ -53,20 +53,20 @@ def read_views(source: str, *, max_views: int) -> Iterator[ImageView]:
     folder = Path(source)
     paths = sorted(p for p in folder.iterdir() if p.suffix.lower() in _IMAGES) if folder.is_dir() else []
     if paths:
-        for k in _spread(len(paths), max_views):
-            values = _beside(paths[k])
-            yield ImageView(paths[k].name, read_color(paths[k]), *values)
+        for share, k in _spread(len(paths), max_views):
+            yield share, ArmView(paths[k].name, *_beside(paths[k])), read_color(paths[k])
         return
     if folder.is_dir() and not any(folder.iterdir()):
         raise InputError("is empty.", file=source, hint="give a folder of images or a log")
     log = open_log(source)
-    for k in _spread(len(log), max_views):
+    for share, k in _spread(len(log), max_views):
         frame = log[k]
-        yield ImageView(f"frame {k}", frame.rgb, frame.joints)
+        yield share, ArmView(f"frame {k}", frame.joints), frame.rgb
 
 
-def _spread(count: int, most: int) -> list[int]:
-    return sorted(set(np.linspace(0, count - 1, min(count, most)).round().astype(int).tolist()))
+def _spread(count: int, most: int) -> list[tuple[float, int]]:
+    chosen = sorted(set(np.linspace(0, count - 1, min(count, most)).round().astype(int).tolist()))
+    return [(number / len(chosen), k) for number, k in enumerate(chosen)]
 
 
 def _beside(image: Path) -> tuple[Array | None, Array | None]:

@@ -10,10 +10,11 @@ import tyro
 
 if TYPE_CHECKING:
     from splatbot.calibration.board import BoardView
+    from splatbot.calibration.estimate import Estimate
     from splatbot.calibration.hand_eye import HandEyeCalibration
     from splatbot.calibration.link_motion import LinkMotion
     from splatbot.calibration.measurements import BoardMeasurement, PoseMeasurement
-    from splatbot.calibration.views import ImageView
+    from splatbot.calibration.views import ArmView
     from splatbot.camera import Camera
     from splatbot.protocols import Array, KinematicChain
 
@@ -50,15 +51,20 @@ def calibrate_intrinsics_command(
     from splatbot.calibration.intrinsics import calibrate_intrinsics
     from splatbot.cli.paths import check_output
     from splatbot.cli.tables import print_table
+    from splatbot.errors import InputError
     from splatbot.logs.calibration import Calibration, save_calibration
 
     check_output(out, folder=False)
     found, size = _detect(views, board, max_views, quiet)
     result = calibrate_intrinsics([view for _, view in found], size)
     if not quiet:
-        rows = [(name, f"{e.value:.4g} ± {e.sigma:.2g} {e.unit}".rstrip()) for name, e in result.estimates.items()]
+        rows = [(name, _value(e)) for name, e in result.estimates.items()]
         rows.append(("reprojection", f"{result.rms:.3f} px RMS, {result.corners:,} corners, {len(result.views)} views"))
         print_table(rows, title=f"{views}: camera {size[0]}x{size[1]}")
+    for name, estimate in result.estimates.items():
+        if estimate.refusal:
+            hint = "take more images, with the board tilted by 20 to 40 degrees and up to the corners of the image"
+            raise InputError(f"is not determined: {estimate.refusal}.", file=views, field=name, hint=hint)
     if out is not None:
         save_calibration(Calibration(result.camera, depth_scale), out)
     return 0
@@ -137,15 +143,24 @@ def calibrate_hand_eye_command(
         found = calibrate_hand_eye(motion, tracked, offsets=wanted, delay=delay)
     if not quiet:
         _print(found, source, eye_to_hand, board is not None)
+    if found.refusal:
+        hint = "turn the link about two axes or more, by 20 degrees or more, in 15 views or more"
+        raise InputError(f"is not determined: {found.refusal}.", file=source, field="pose on the link", hint=hint)
     if out is not None:
         _write(found, out, link, eye_to_hand, tracked=board is None)
     return 0
 
 
+def _value(estimate: Estimate) -> str:
+    if estimate.refusal:
+        return f"not known: {estimate.refusal}"
+    return f"{estimate.value:.4g} ± {estimate.sigma:.2g} {estimate.unit}".rstrip()
+
+
 def _detect(
     source: str, board: str, max_views: int, quiet: bool
-) -> tuple[list[tuple[ImageView, BoardView]], tuple[int, int]]:
-    """Return the images with their corners, and the size (width, height) of all of them.
+) -> tuple[list[tuple[ArmView, BoardView]], tuple[int, int]]:
+    """Return the arm at each image with the corners in it, and the size (width, height) of all of them.
 
     Raises:
         InputError: the images differ in size, or none shows the board.
@@ -158,17 +173,28 @@ def _detect(
     spec = CharucoBoard.parse(board)
     if max_views < 1:
         raise InputError(f"is {max_views}.", field="--max-views", hint="give 20 to 200")
-    views = list(read_views(source, max_views=max_views))
-    sizes = {view.image.shape[1::-1] for view in views}
-    if len(sizes) != 1:
-        named = ", ".join(f"{w}x{h}" for w, h in sorted(sizes)) or "no images"
-        raise InputError(f"holds images of {named}.", file=source, field="views", hint="give images of one camera")
-    spec = spec.completed(view.image for view in views)
-    found = []
+    found: list[tuple[ArmView, BoardView]] = []
+    sizes: set[tuple[int, int]] = set()
+    refusal = None
     with shares(quiet) as show:
-        for number, view in enumerate(views):
-            show("board", number / len(views))
-            found.append((view, spec.detect(view.image)))
+        for share, arm, image in read_views(source, max_views=max_views):
+            show("board", share)
+            sizes.add((image.shape[1], image.shape[0]))
+            if len(sizes) > 1:
+                named = ", ".join(f"{w}x{h}" for w, h in sorted(sizes))
+                hint = "give images of one camera"
+                raise InputError(f"has images of {named}.", file=source, field="views", hint=hint)
+            if not spec.complete:
+                try:
+                    spec = spec.completed(image)
+                except InputError as error:  # the board may be in a later image
+                    refusal = error
+                    continue
+            found.append((arm, spec.detect(image)))
+    if refusal is not None and not found:
+        raise refusal
+    if not sizes:
+        raise InputError("has no images.", file=source, field="views", hint="give a folder of images or a log")
     return found, sizes.pop()
 
 

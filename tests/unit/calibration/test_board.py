@@ -47,7 +47,7 @@ def test_corners_of_a_rendered_board_are_found_where_they_are(legacy: bool) -> N
 def test_an_unknown_dictionary_and_pattern_are_found_in_the_image(dictionary: str, legacy: bool) -> None:
     board = CharucoBoard(6, 8, 0.05, 0.035, dictionary, legacy)
     image = photograph(board, POSE)
-    found = CharucoBoard.parse("charuco:6x8:0.05:0.035").completed([np.zeros_like(image), image])
+    found = CharucoBoard.parse("charuco:6x8:0.05:0.035").completed(image)
     assert found.legacy is legacy
     view = found.detect(image)
     assert len(view) >= 28  # of 35
@@ -56,8 +56,8 @@ def test_an_unknown_dictionary_and_pattern_are_found_in_the_image(dictionary: st
 
 def test_images_without_the_board_are_refused_with_a_fix() -> None:
     noise = np.random.default_rng(0).integers(0, 255, (240, 320, 3)).astype(np.uint8)
-    with pytest.raises(InputError, match="is in no image") as caught:
-        CharucoBoard.parse("charuco:6x8:0.05:0.035").completed([noise])
+    with pytest.raises(InputError, match="is not in the image") as caught:
+        CharucoBoard.parse("charuco:6x8:0.05:0.035").completed(noise)
     assert caught.value.hint
     assert len(CharucoBoard(6, 8, 0.05, 0.035, "5X5_100", False).detect(noise)) == 0
 

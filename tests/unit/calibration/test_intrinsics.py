@@ -58,8 +58,8 @@ def test_the_recorded_board_fits_to_an_eighth_of_a_pixel(data_root: Path) -> Non
     from splatbot.calibration.board import CharucoBoard
     from splatbot.calibration.views import read_views
 
-    images = [view.image for view in read_views(str(data_root / "panda_charuco_32"), max_views=12)]
-    board = CharucoBoard.parse("charuco:10x14:0.07:0.04").completed(images)
+    images = [image for _, _, image in read_views(str(data_root / "panda_charuco_32"), max_views=12)]
+    board = CharucoBoard.parse("charuco:10x14:0.07:0.04").completed(images[0])
     assert board.legacy
     found = calibrate_intrinsics([board.detect(image) for image in images], (640, 480))
     assert found.rms < 0.15

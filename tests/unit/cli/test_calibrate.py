@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+from splatbot.calibration.board import CharucoBoard
 from splatbot.calibration.views import read_views
 from splatbot.config import Config, load_config, with_sensor
 from splatbot.errors import ConfigError, FormatError
@@ -156,3 +157,18 @@ def test_a_damaged_file_next_to_an_image_is_named(tmp_path: Path, text: str) -> 
     (tmp_path / "a.yaml").write_text(text)
     with pytest.raises(FormatError, match=r"a\.yaml"):
         list(read_views(str(tmp_path), max_views=3))
+
+
+def test_images_of_a_board_parallel_to_the_image_give_no_camera_file(run: RunCommand, tmp_path: Path) -> None:
+    from tests.unit.calibration.test_board import photograph
+
+    board = CharucoBoard(6, 8, 0.05, 0.035, "4X4_50", False)
+    for k in range(8):
+        T = np.eye(4)
+        T[:3, 3] = [-0.15 + 0.01 * k, -0.2, 0.6 + 0.03 * k]
+        cv2.imwrite(str(tmp_path / f"{k}.png"), photograph(board, T))
+    words = ("--board", "charuco:6x8:0.05:0.035", "--out", tmp_path / "camera.json")
+    answer = run("calibrate", "intrinsics", tmp_path, *words)
+    assert answer.code == 2
+    assert "is not determined" in answer.err
+    assert not (tmp_path / "camera.json").exists()
