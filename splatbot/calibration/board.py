@@ -36,6 +36,14 @@ class BoardView:
     def __len__(self) -> int:
         return len(self.pixels)
 
+    @property
+    def usable(self) -> bool:
+        """Return whether the corners determine a pose: 8 or more, not in one line."""
+        if len(self) < MIN_CORNERS:
+            return False
+        spread = np.linalg.svd(self.points - self.points.mean(axis=0), compute_uv=False)
+        return bool(spread[1] > 0.05 * spread[0])
+
 
 @dataclass(frozen=True)
 class CharucoBoard:

@@ -36,8 +36,8 @@ class HandEyeConstants:
 
     pose_prior: float = 10.0
     """Standard deviation [m and rad] of the prior of X and Y around the closed form: none for any arm in a room."""
-    offset_prior: float = 0.05
-    """Standard deviation [rad or m] of the prior of a joint offset. Larger ones hold undetermined offsets less."""
+    offset_prior: float = 0.02
+    """Standard deviation [rad or m] of the prior of a joint offset. Recorded arms err by up to 17 mrad."""
     delay_prior: float = 1.0
     """Standard deviation [s] of the prior of the time offset, around the one of the cross-correlation."""
     largest_offset_sigma: float = 0.005
@@ -53,6 +53,8 @@ class HandEyeConstants:
     rounds: int = 4
     """Number of solutions [1] with standard deviations from the errors of the one before; they change by less than 1 %
     after three."""
+    least_share: float = 0.05
+    """Least share [1] of small errors, in the units of the weights, that the jackknife divides by."""
     blocks: int = 40
     """Largest number of blocks of neighbouring views [1] that are held out together or left out by the jackknife."""
     least_turn: float = 0.02
@@ -76,10 +78,12 @@ class HandEyeCalibration:
     Args:
         T_link_moving: (4, 4) pose X on the link: of the camera, or of a board in front of a static camera [m].
         T_base_static: (4, 4) pose Y in the base: of the board or the map, or of a static camera [m].
-        sigma_moving, sigma_static: (6,) standard deviations of their translation [m] and rotation [rad].
+        covariance_moving, covariance_static: (6, 6) of the twists (translation [m], rotation [rad]) of both, along the
+            axes of the moving and of the static frame.
         offsets: offset of each joint [rad or m], to be added to its measured position; empty if none is estimated.
         delay: time offset [s]: the link was at the pose of a view this time after the view's stamp.
         error: median error over all views in ``unit``.
+        largest_error: largest error of a useful calibration.
         held_out: median error of held-out views without joint offsets and, if they are estimated, with them.
         unit: unit of the errors.
         views: number of views.
@@ -87,22 +91,49 @@ class HandEyeCalibration:
 
     T_link_moving: Array
     T_base_static: Array
-    sigma_moving: Array
-    sigma_static: Array
+    covariance_moving: Array
+    covariance_static: Array
     offsets: dict[str, Estimate]
     delay: Estimate | None
     error: float
+    largest_error: float
     held_out: tuple[float, ...]
     unit: str
     views: int
 
     @property
-    def refusal(self) -> str:
-        """Reason why the pose on the link is of no use, empty if it is."""
-        shift, turn = float(self.sigma_moving[:3].max()), float(self.sigma_moving[3:].max())
-        if shift <= CONSTANTS.largest_pose_sigma[0] and turn <= CONSTANTS.largest_pose_sigma[1]:
-            return ""
-        return f"its standard deviation is up to {1e3 * shift:.0f} mm and {np.degrees(turn):.1f} degrees"
+    def sigma_moving(self) -> Array:
+        """Standard deviations (6,) of X: translation [m] and rotation [rad] along the axes of the moving frame."""
+        return np.asarray(np.sqrt(np.diag(self.covariance_moving)))
+
+    @property
+    def sigma_static(self) -> Array:
+        """Standard deviations (6,) of Y: translation [m] and rotation [rad] along the axes of the static frame."""
+        return np.asarray(np.sqrt(np.diag(self.covariance_static)))
+
+    def check(self, *, moving: bool, static: bool) -> None:
+        """Check that the poses that are used are determined, and that the views agree with them.
+
+        Args:
+            moving, static: whether X and Y are used.
+
+        Raises:
+            InputError: the error of the views or a standard deviation is too large.
+        """
+        if self.error > self.largest_error:
+            raise InputError(
+                f"disagree by {self.error:.1f} {self.unit}, more than {self.largest_error:.1f}.",
+                field="views and arm",
+                hint="check the side of a square, the robot, radians, inverted poses, and --eye-to-hand",
+            )
+        for used, name, sigma in ((moving, "link", self.sigma_moving), (static, "base", self.sigma_static)):
+            shift, turn = float(sigma[:3].max()), float(sigma[3:].max())
+            if used and (shift > CONSTANTS.largest_pose_sigma[0] or turn > CONSTANTS.largest_pose_sigma[1]):
+                raise InputError(
+                    f"is not determined, its deviation is {1e3 * shift:.0f} mm, {np.degrees(turn):.1f} degrees.",
+                    field=f"pose in the {name}",
+                    hint="turn the link about two axes or more, by 20 degrees or more, in 15 views or more",
+                )
 
     @property
     def joint_offsets(self) -> Array:
@@ -203,38 +234,55 @@ class _Model:
     def _residuals(self, x: Array) -> Array:
         return np.concatenate([*self.measured.residuals(self.predict(x)), self.prior * x])
 
-    def covariance(self, x: Array) -> Array:
-        """Compute the covariance of the unknowns, of noise and prior and of the jackknife over blocks of views.
+    def covariance(self, x: Array, considered: tuple[str, ...]) -> Array:
+        """Compute the covariance of the unknowns.
 
         The errors of one view are not independent, because the arm and the tracking err for the whole view. The
         delete-one-block jackknife (Efron 1982), linearized at the solution, needs no model of them:
-        (B - 1)/B Σ d_b d_bᵀ with d_b = (H - H_b)⁻¹ g_b.
+        (B - 1)/B Σ d_b d_bᵀ with d_b = (H - H_b)⁻¹ g_b / m. Here m is the mean of ψ'(r) over that of ψ(r)/r, because H
+        of Huber's loss has the weights ψ(r)/r (Huber 1981, section 7.6). ``considered`` offsets are 0 in the solution:
+        K σ² Kᵀ with K = H⁻¹ H_kc adds the effect of their unknown values (Schmidt-Kalman).
         """
         sizes = [len(r) for r in self.measured.residuals(self.predict(x))]
-        found = least_squares(self._residuals, x, max_nfev=1)
-        weights = np.sqrt(np.minimum(1.0, CONSTANTS.huber / np.maximum(np.abs(found.fun), 1e-300)))
-        J, r = found.jac * weights[:, None], found.fun * weights
-        H = J.T @ J
+        wide = _Model(self.motion, self.measured, (*self.names, *considered), self.delay, start=(self.X, self.Y))
+        split = 12 + len(self.names)
+        added = np.arange(split, split + len(considered))
+        found = least_squares(wide._residuals, np.insert(x, split, np.zeros(len(considered))), max_nfev=1)
+        size = np.maximum(np.abs(found.fun), 1e-300)
+        weights = np.minimum(1.0, CONSTANTS.huber / size)
+        J, r = found.jac * np.sqrt(weights)[:, None], found.fun * np.sqrt(weights)
+        data = slice(0, sum(sizes))
+        share = float((size[data] <= CONSTANTS.huber).mean()) / float(weights[data].mean())
+        every = J.T @ J
+        kept = np.setdiff1d(np.arange(len(every)), added)
+        H = every[np.ix_(kept, kept)]
         edges = np.concatenate([[0], np.cumsum(sizes)])
         blocks = np.array_split(np.arange(len(sizes)), min(len(sizes), CONSTANTS.blocks))
-        count, steps = len(blocks), []
+        steps = []
         for views in blocks:
-            rows = slice(edges[views[0]], edges[views[-1] + 1])
-            steps.append(np.linalg.solve(H - J[rows].T @ J[rows], J[rows].T @ r[rows]))
-        return np.asarray(np.linalg.inv(H) + (count - 1) / count * np.transpose(steps) @ np.array(steps))
+            part = J[edges[views[0]] : edges[views[-1] + 1]][:, kept]
+            g = part.T @ r[edges[views[0]] : edges[views[-1] + 1]]
+            steps.append(_inverse(H - part.T @ part) @ g / max(share, CONSTANTS.least_share))
+        K = CONSTANTS.offset_prior * _inverse(H) @ every[np.ix_(kept, added)]
+        jackknife = (len(blocks) - 1) / len(blocks) * np.transpose(steps) @ np.array(steps)
+        return np.asarray(_inverse(H) + jackknife + K @ K.T)
 
     def result(self, x: Array, held_out: tuple[float, ...], refused: dict[str, Estimate]) -> HandEyeCalibration:
         """Return the calibration of a solution; ``refused`` offsets are 0 in it."""
-        sigma = np.sqrt(np.diag(self.covariance(x)))
+        covariance = self.covariance(x, tuple(refused))
+        sigma = np.sqrt(np.diag(covariance))
         need = "move the other joints more, or this one with the camera close to the target"
-        limit = CONSTANTS.largest_offset_sigma
+        limit, units = CONSTANTS.largest_offset_sigma, dict(zip(self.motion.offsets, self.motion.units, strict=True))
         offsets = {
-            name: Estimate.limited(float(x[12 + k]), float(sigma[12 + k]), "rad", limit, need)
+            name: Estimate.limited(float(x[12 + k]), float(sigma[12 + k]), units[name], limit, need)
             for k, name in enumerate(self.names)
         }
         if offsets or refused:
-            ends = [Estimate(0.0, CONSTANTS.offset_prior, "rad", reason) for reason in UNKNOWABLE]
             first, *_, last = self.motion.offsets
+            ends = [
+                Estimate(0.0, CONSTANTS.offset_prior, units[name], reason)
+                for name, reason in zip((first, last), UNKNOWABLE, strict=True)
+            ]
             every = {first: ends[0], **offsets, **refused, last: ends[1]}
             offsets = {name: every[name] for name in self.motion.offsets}
         delay = None
@@ -245,15 +293,22 @@ class _Model:
         return HandEyeCalibration(
             self.X @ se3_exp(x[:6]),
             self.Y @ se3_exp(x[6:12]),
-            sigma[:6],
-            sigma[6:12],
+            covariance[:6, :6],
+            covariance[6:12, 6:12],
             offsets,
             delay,
             self.measured.error(self.measured.residuals(self.predict(x))),
+            self.measured.largest_error,
             held_out,
             self.measured.unit,
             len(self.motion),
         )
+
+
+def _inverse(H: Array) -> Array:
+    """Compute the inverse of a positive semidefinite matrix; undetermined values get a huge variance."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(H), 1e-12))
+    return np.asarray(scale[:, None] * np.linalg.inv(scale[:, None] * H * scale + 1e-12 * np.eye(len(H))) * scale)
 
 
 def closed_form(T_base_link: Array, T_static_moving: Array) -> tuple[Array, Array]:

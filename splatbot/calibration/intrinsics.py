@@ -18,7 +18,8 @@ Array = NDArray[np.float64]
 
 MIN_VIEWS = 6
 """Least number of views [1]: of fewer, one bad view changes the focal length by percents."""
-_LARGEST = {"fx": 0.01, "fy": 0.01, "cx": 0.01, "cy": 0.01}  # [1] standard deviation over the width of the image
+_LARGEST_SIGMA = 0.01  # [1] of the width of the image: by which a pixel at its corner may be off
+_LARGEST_RMS = 1 / 640  # [1] of the width of the image
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +54,7 @@ def calibrate_intrinsics(views: Sequence[BoardView], size: tuple[int, int]) -> I
     Raises:
         InputError: fewer than 6 views show the board, or they do not determine the camera.
     """
-    chosen = [view for view in views if len(view) >= MIN_CORNERS]
+    chosen = [view for view in views if view.usable]
     if len(chosen) < MIN_VIEWS:
         raise InputError(
             f"{len(chosen)} of {len(views)} images show {MIN_CORNERS} corners of the board or more.",
@@ -64,9 +65,20 @@ def calibrate_intrinsics(views: Sequence[BoardView], size: tuple[int, int]) -> I
     halves = [_fit(chosen[k::2], size)[1] for k in (0, 1)]
     sigma = np.maximum(sigma, 0.5 * np.abs(halves[0] - halves[1]))
     names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+    corner = 0.5 * float(np.hypot(*size)) / values[0]  # [1] distance from the axis
+    reach = dict(zip(names, (corner, corner, 1.0, 1.0), strict=False))
+    reach |= {"k1": corner**3, "k2": corner**5, "k3": corner**7, "p1": 3 * corner**2, "p2": 3 * corner**2}
+    pixels = {name: (1.0 if name in ("fx", "fy", "cx", "cy") else values[0]) * r for name, r in reach.items()}
+    limits = {name: _LARGEST_SIGMA * size[0] / max(p, 1e-12) for name, p in pixels.items()}
+    if rms > _LARGEST_RMS * size[0]:
+        raise InputError(
+            f"do not fit the model: {rms:.2f} px RMS.",
+            field="views",
+            hint="check the numbers of squares and the side of a square; the model is no fisheye lens",
+        )
     need = "tilt the board more against the image, and fill the corners of the image"
     estimates = {
-        name: Estimate.limited(float(v), float(s), "px" if name in _LARGEST else "", _limit(name, size), need)
+        name: Estimate.limited(float(v), float(s), "px" if name in ("fx", "fy", "cx", "cy") else "", limits[name], need)
         for name, v, s in zip(names, values, sigma, strict=True)
     }
     fx, fy, cx, cy, *distortion = (float(value) for value in values)
@@ -86,7 +98,3 @@ def _fit(views: Sequence[BoardView], size: tuple[int, int]) -> tuple[float, Arra
         ) from error
     values = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *np.reshape(D, -1)[:5]])
     return float(rms), values, np.reshape(sigma, -1)[:9].astype(np.float64), np.reshape(errors, -1)
-
-
-def _limit(name: str, size: tuple[int, int]) -> float:
-    return _LARGEST[name] * size[0] if name in _LARGEST else np.inf

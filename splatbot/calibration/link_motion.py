@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from functools import cached_property
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
+from splatbot.errors import InputError
 from splatbot.protocols import KinematicChain
 
 Array = NDArray[np.float64]
+
+_BEYOND = 0.2  # [rad or m] beyond its limits that a measured joint position may be
 
 
 class LinkMotion(Protocol):
@@ -20,6 +24,11 @@ class LinkMotion(Protocol):
     @property
     def offsets(self) -> tuple[str, ...]:
         """Names of the joints whose offsets change the poses; empty for recorded poses."""
+        ...
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Unit of each offset: "rad" or "m"."""
         ...
 
     def __len__(self) -> int: ...
@@ -55,6 +64,11 @@ class JointLinkMotion:
     def offsets(self) -> tuple[str, ...]:
         """Names of the joints before the link."""
         return self.chain.names[: self.link]
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Unit of each offset."""
+        return tuple("m" if prismatic else "rad" for prismatic in self.chain.prismatic[: self.link])
 
     def __len__(self) -> int:
         return len(self.joints if self.at is None else self.at)
@@ -92,6 +106,11 @@ class PoseLinkMotion:
         """No names: the joints are not known."""
         return ()
 
+    @property
+    def units(self) -> tuple[str, ...]:
+        """No units."""
+        return ()
+
     def __len__(self) -> int:
         return len(self.T_base_link if self.at is None else self.at)
 
@@ -101,9 +120,13 @@ class PoseLinkMotion:
             return self.T_base_link
         times = np.clip(self.at + delay, self.stamps[0], self.stamps[-1])
         T = np.tile(np.eye(4), (len(times), 1, 1))
-        T[:, :3, :3] = Slerp(self.stamps, Rotation.from_matrix(self.T_base_link[:, :3, :3]))(times).as_matrix()
+        T[:, :3, :3] = self._rotations(times).as_matrix()
         T[:, :3, 3] = np.column_stack([np.interp(times, self.stamps, x) for x in self.T_base_link[:, :3, 3].T])
         return T
+
+    @cached_property
+    def _rotations(self) -> Any:
+        return Slerp(self.stamps, Rotation.from_matrix(self.T_base_link[:, :3, :3]))
 
     def select(self, rows: NDArray[np.intp]) -> PoseLinkMotion:
         """Implement :class:`LinkMotion`."""
@@ -111,6 +134,32 @@ class PoseLinkMotion:
             PoseLinkMotion(self.T_base_link[rows])
             if self.at is None
             else PoseLinkMotion(self.T_base_link, self.stamps, self.at[rows])
+        )
+
+
+def check_joints(chain: KinematicChain, joints: Array, *, robot: str, file: str) -> None:
+    """Check that joint positions (N, >= J) [rad or m] can be those of an arm; columns of a gripper may follow.
+
+    Raises:
+        InputError: there are too few columns, a value is not finite, or a position is far beyond its limits.
+    """
+    count = len(chain)
+    if joints.ndim != 2 or joints.shape[1] < count:
+        found = joints.shape[1] if joints.ndim == 2 else 0
+        hint = "give the joints of this robot, or the robot of these joints"
+        raise InputError(f"has {found} joints, {robot} has {count}.", file=file, field="joints", hint=hint)
+    q = joints[:, :count]
+    if not np.isfinite(q).all():
+        raise InputError("has values that are not finite.", file=file, field="joints", hint="remove these lines")
+    beyond = np.maximum(chain.lower - q, q - chain.upper).max(axis=0)
+    if beyond.max() > _BEYOND:
+        k = int(beyond.argmax())
+        worst = float(q[np.abs(q[:, k]).argmax(), k])
+        raise InputError(
+            f"{chain.names[k]} is {worst:.4g}, its limits are {chain.lower[k]:.4g} to {chain.upper[k]:.4g}.",
+            file=file,
+            field="joints",
+            hint=f"give radians, in the order of the joints of {robot}: {', '.join(chain.names)}",
         )
 
 

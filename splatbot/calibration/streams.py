@@ -21,6 +21,7 @@ Array = NDArray[np.float64]
 MAX_POSES = 600
 """Largest number of tracked poses of a problem [1]; more change the result less than its standard deviation."""
 _SAME_INSTANT = 1e-6  # [s] between stamps of views that were recorded together
+_AROUND = 2.0  # [s] of the arm's record before and after the tracked poses that are kept
 _MAX_PERIOD = 0.2  # [s] of recordings whose time offset can be estimated
 
 
@@ -46,7 +47,7 @@ def align_streams(
     """Return motion and measurement at the tracked poses for which the arm is known.
 
     The time offset of two recordings at 5 Hz or more starts with :func:`cross_correlate`. Slower ones must have the
-    same clock.
+    same clock. An arm that is recorded at less than 5 Hz is known only at the stamps of its record.
 
     Args:
         tracked: tracked poses over time.
@@ -64,20 +65,27 @@ def align_streams(
     arm = T_base_link if joints is None or chain is None else link_poses(chain, joints, link)
     if arm is None:
         raise InputError("needs joints or poses.", field="motion")
-    slow = max(float(np.median(np.diff(s))) if len(s) > 1 else np.inf for s in (tracked.stamps, stamps)) > _MAX_PERIOD
-    delay = None if same_clock or slow else cross_correlate(stamps, arm, tracked.stamps, tracked.T_world_camera)
+    periods = [float(np.median(np.diff(s))) if len(s) > 1 else np.inf for s in (tracked.stamps, stamps)]
+    delay = (
+        None
+        if same_clock or max(periods) > _MAX_PERIOD
+        else cross_correlate(stamps, arm, tracked.stamps, tracked.T_world_camera)
+    )
     origin = float(tracked.stamps[0])
     at, times = tracked.stamps - origin, stamps - (origin + (delay or 0.0))
     before = np.clip(np.searchsorted(times, at, side="right") - 1, 0, len(times) - 1)
     after = np.clip(np.searchsorted(times, at), 0, len(times) - 1)
     gap = np.maximum(np.abs(at - times[before]), np.abs(times[after] - at))
-    rows = np.flatnonzero(gap <= (_SAME_INSTANT if slow else MAX_GAP))
+    rows = np.flatnonzero(gap <= (_SAME_INSTANT if periods[1] > _MAX_PERIOD else MAX_GAP))
     if not len(rows):
         raise InputError(
-            "do not overlap in time.", field="recordings", hint="give the arm's record of this log, with its clock"
+            "do not overlap in time.",
+            field="recordings",
+            hint="give the arm's record of this log, with its clock, in seconds",
         )
     rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MAX_POSES)).round().astype(int))]
     measured = PoseMeasurement(tracked.T_world_camera[rows])
+    near = (times > at[rows[0]] - _AROUND) & (times < at[rows[-1]] + _AROUND)
     if joints is None or chain is None:
-        return PoseLinkMotion(arm, times, at[rows]), measured, delay
-    return JointLinkMotion(chain, joints, link, times, at[rows]), measured, delay
+        return PoseLinkMotion(arm[near], times[near], at[rows]), measured, delay
+    return JointLinkMotion(chain, joints[near], link, times[near], at[rows]), measured, delay

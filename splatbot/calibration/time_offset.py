@@ -13,9 +13,11 @@ Array = NDArray[np.float64]
 
 _STEP = 0.005  # [s] of the grid on which speeds are compared; the peak is interpolated between its points
 _WINDOW = 0.1  # [s] over which a speed is the mean, or two samples: the noise of poses at 100 Hz hides slow motion
-_MIN_OVERLAP = 0.3  # [1] of the shorter recording
+_MIN_OVERLAP = 0.5  # [1] of the shorter recording
 _MAX_SAMPLES = 2_000_000  # of a recording on the grid: 2.8 hours
-_LEAST_CORRELATION = 0.5  # [1] of a peak that can be trusted as a start
+_LEAST_VARIANCE = 0.1  # [1] of the variance of all speeds that those of an overlap need
+_APART, _AMBIGUOUS = 1.0, 0.03  # [s] and [1]: another peak so far away, and lower by so little, leaves a doubt
+_LEAST_CORRELATION = 0.6  # [1] of a peak that can be trusted as a start
 
 
 def cross_correlate(stamps_a: Array, T_a: Array, stamps_b: Array, T_b: Array) -> float:
@@ -29,23 +31,38 @@ def cross_correlate(stamps_a: Array, T_a: Array, stamps_b: Array, T_b: Array) ->
         T_a, T_b: (N, 4, 4), (M, 4, 4) poses of the two frames.
 
     Raises:
-        InputError: a recording is too short or too long, or the speeds do not agree anywhere.
+        InputError: a recording is too short or too long, or the speeds agree nowhere or at several delays.
     """
     window = max(_WINDOW, *(2.0 * float(np.median(np.diff(stamps))) for stamps in (stamps_a, stamps_b)))
     starts, speeds = zip(*(_angular_speed(t, T, window) for t, T in ((stamps_a, T_a), (stamps_b, T_b))), strict=True)
     a, b = (speed - speed.mean() for speed in speeds)
     lags = correlation_lags(len(a), len(b))
     ones = np.ones(len(a)), np.ones(len(b))
-    overlap = np.rint(correlate(*ones))
-    energy = np.maximum(correlate(a**2, ones[1]), 0.0) * np.maximum(correlate(ones[0], b**2), 0.0)
-    enough = overlap >= _MIN_OVERLAP * min(len(a), len(b))
-    score = np.where(enough, correlate(a, b) / np.sqrt(np.maximum(energy, 1e-12 * energy.max() + 1e-300)), -1.0)
+    overlap = np.maximum(np.rint(correlate(*ones)), 1.0)
+    mean_a, mean_b = correlate(a, ones[1]) / overlap, correlate(ones[0], b) / overlap
+    var_a = correlate(a**2, ones[1]) / overlap - mean_a**2
+    var_b = correlate(ones[0], b**2) / overlap - mean_b**2
+    moves = (var_a > _LEAST_VARIANCE * a.var()) & (var_b > _LEAST_VARIANCE * b.var())  # not two arms at rest
+    enough = moves & (overlap >= _MIN_OVERLAP * min(len(a), len(b)))
+    scale = np.sqrt(np.where(enough, var_a * var_b, 1.0))
+    score = np.where(
+        enough & (scale > 0), (correlate(a, b) / overlap - mean_a * mean_b) / np.maximum(scale, 1e-300), -1.0
+    )
     best = int(np.argmax(score))
     if not score[best] > _LEAST_CORRELATION:
         raise InputError(
             f"do not agree: their angular speeds correlate by {score[best]:.2f} at most.",
             field="recordings",
-            hint="give two recordings of one motion that turns, both at 5 Hz or more",
+            hint="give two recordings of one motion that turns, both at 5 Hz or more, or --same-clock",
+        )
+    peaks = np.flatnonzero((score[1:-1] >= score[:-2]) & (score[1:-1] > score[2:])) + 1
+    others = peaks[np.abs(peaks - best) * _STEP > _APART]
+    if len(others) and score[others].max() > score[best] - _AMBIGUOUS:
+        other = int(others[score[others].argmax()])
+        raise InputError(
+            f"agree at two time offsets, {_STEP * abs(other - best):.2f} s apart: the motion repeats.",
+            field="recordings",
+            hint="give a part that does not repeat, or --same-clock if both have one clock",
         )
     shift = 0.0
     if 0 < best < len(score) - 1 and enough[best - 1] and enough[best + 1]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +11,8 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from splatbot.errors import FormatError, InputError
-from splatbot.logs import open_log
+from splatbot.errors import CameraError, FormatError, InputError, LogError
+from splatbot.logs import Log, open_log
 from splatbot.logs.images import read_color
 
 Array = NDArray[np.float64]
@@ -58,10 +58,32 @@ def read_views(source: str, *, max_views: int) -> Iterator[tuple[float, ArmView,
         return
     if folder.is_dir() and not any(folder.iterdir()):
         raise InputError("is empty.", file=source, hint="give a folder of images or a log")
-    log = open_log(source)
+    log = _open_raw(source)
+    damaged: LogError | None = None
+    whole = 0
     for share, k in _spread(len(log), max_views):
-        frame = log[k]
+        try:
+            frame = log[k]
+        except LogError as error:  # one damaged frame of a log is no reason to stop
+            damaged = error
+            continue
+        whole += 1
         yield share, ArmView(f"frame {k}", frame.joints), frame.rgb
+    if damaged is not None and not whole:
+        raise damaged
+
+
+def _open_raw(source: str) -> Log:
+    """Open a log whose images are not rectified, because their distortion is to be estimated."""
+    try:
+        log = open_log(source)
+    except CameraError as error:
+        hint = "give the folder of its colour images instead, such as LOG/rgb"
+        raise InputError("has no intrinsics yet.", file=source, field="views", hint=hint) from error
+    recorded = log.calibration
+    if not recorded.camera.distortion:
+        return log
+    return open_log(source, camera=replace(recorded, camera=replace(recorded.camera, distortion=())))
 
 
 def _spread(count: int, most: int) -> list[tuple[float, int]]:
@@ -90,6 +112,9 @@ def _beside(image: Path) -> tuple[Array | None, Array | None]:
 def _pose(path: Path, found: dict[str, Any]) -> Array | None:
     if "T_base_link" in found:
         T = _numbers(path, "T_base_link", found["T_base_link"], (4, 4))
+        if np.abs(T[3] - [0.0, 0.0, 0.0, 1.0]).max() > 1e-6:
+            hint = "write rows, not columns: transpose the O_T_EE of a Franka robot"
+            raise FormatError("has a last row other than 0 0 0 1.", file=path, field="T_base_link", hint=hint)
     elif "r_mtx" in found and "t_vec" in found:
         T = np.eye(4)
         R = _numbers(path, "r_mtx", found["r_mtx"], (-1,))
@@ -100,7 +125,7 @@ def _pose(path: Path, found: dict[str, Any]) -> Array | None:
         T[:3, 3] = _numbers(path, "t_vec", found["t_vec"], (3,))
     else:
         return None
-    if np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > 1e-3:
+    if np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > 1e-3 or np.linalg.det(T[:3, :3]) < 0:
         raise FormatError("is no rotation.", file=path, field="pose", hint=f"write {_LAYOUT}")
     U, _, Vt = np.linalg.svd(T[:3, :3])
     T[:3, :3] = U @ Vt

@@ -12,13 +12,15 @@ if TYPE_CHECKING:
     from splatbot.calibration.board import BoardView
     from splatbot.calibration.estimate import Estimate
     from splatbot.calibration.hand_eye import HandEyeCalibration
+    from splatbot.calibration.intrinsics import IntrinsicsCalibration
     from splatbot.calibration.link_motion import LinkMotion
-    from splatbot.calibration.measurements import BoardMeasurement, PoseMeasurement
+    from splatbot.calibration.measurements import BoardMeasurement, Measurement, PoseMeasurement
     from splatbot.calibration.views import ArmView
     from splatbot.camera import Camera
     from splatbot.protocols import Array, KinematicChain
 
 _MAX_VIEWS = 100
+_MOST_MISSES = 10  # images without the board before all others are given up: each is searched with all dictionaries
 
 
 def calibrate_intrinsics_command(
@@ -51,7 +53,6 @@ def calibrate_intrinsics_command(
     from splatbot.calibration.intrinsics import calibrate_intrinsics
     from splatbot.cli.paths import check_output
     from splatbot.cli.tables import print_table
-    from splatbot.errors import InputError
     from splatbot.logs.calibration import Calibration, save_calibration
 
     check_output(out, folder=False)
@@ -61,10 +62,7 @@ def calibrate_intrinsics_command(
         rows = [(name, _value(e)) for name, e in result.estimates.items()]
         rows.append(("reprojection", f"{result.rms:.3f} px RMS, {result.corners:,} corners, {len(result.views)} views"))
         print_table(rows, title=f"{views}: camera {size[0]}x{size[1]}")
-    for name, estimate in result.estimates.items():
-        if estimate.refusal:
-            hint = "take more images, with the board tilted by 20 to 40 degrees and up to the corners of the image"
-            raise InputError(f"is not determined: {estimate.refusal}.", file=views, field=name, hint=hint)
+    _require(result, views)
     if out is not None:
         save_calibration(Calibration(result.camera, depth_scale), out)
     return 0
@@ -79,7 +77,7 @@ def calibrate_hand_eye_command(
     poses: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
     camera: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE")] = None,
     eye_to_hand: bool = False,
-    link: int = -1,
+    link: int | None = None,
     offsets: Literal["auto", "yes", "no"] = "auto",
     same_clock: bool = False,
     max_views: int = _MAX_VIEWS,
@@ -90,7 +88,7 @@ def calibrate_hand_eye_command(
 
     With a board: images or a log show a static ChArUco board from the camera on the arm. With --eye-to-hand, they show
     a board on the arm from a static camera. Each image has the arm's joints or pose: in a YAML file of its name
-    (joint_values, T_base_link), or in the log.
+    (joint_values, T_base_link), or in the log. The arm is at rest in each image.
 
     Without a board: the poses that `splatbot map` has tracked, with the joints or the poses of the arm over time. Two
     pose files of one motion do as well.
@@ -101,7 +99,7 @@ def calibrate_hand_eye_command(
     Examples:
         splatbot calibrate hand-eye images --board charuco:10x14:0.07:0.04 --robot panda --out scene.yaml
         splatbot calibrate hand-eye runs/wrist --robot panda --joints wrist/joints.txt --out runs/wrist/scene.yaml
-        splatbot calibrate hand-eye runs/wrist --poses wrist/ee_poses.txt
+        splatbot calibrate hand-eye runs/wrist --poses wrist/ee_poses.txt --link -1 --out runs/wrist/scene.yaml
 
     Args:
         source: folder of images or a log with --board; else a run's folder or a pose file (stamp tx ty tz qx qy qz qw).
@@ -111,11 +109,11 @@ def calibrate_hand_eye_command(
         poses: poses of the link in the base over time, lines `stamp tx ty tz qx qy qz qw` [s, m].
         camera: intrinsics of the images with --board (a camera file or a preset); by default they are estimated first.
         eye_to_hand: the camera is static and the board is on the arm.
-        link: link that carries the camera or the board; -1 is the last one.
+        link: link that carries the camera or the board; by default the last one, -1.
         offsets: whether offsets of joints are estimated.
         same_clock: the stamps of both recordings agree; no time offset is estimated.
         max_views: largest number of images that are used, evenly spread.
-        out: scene.yaml to write; fields of an existing one that are not estimated are kept.
+        out: scene.yaml to write; the fields of an existing one that this command estimates are replaced.
         quiet: no progress and no table, only errors.
     """
     from splatbot.calibration.hand_eye import calibrate_hand_eye
@@ -125,30 +123,50 @@ def calibrate_hand_eye_command(
 
     check_output(out, folder=False)
     chain = None if robot is None else load_robot(robot).chain
-    if chain is not None and not (-len(chain) <= link <= len(chain) and link != 0):
+    carrier = -1 if link is None else link
+    if chain is not None and not (-len(chain) <= carrier <= len(chain) and carrier != 0):
         raise InputError(f"is {link}.", field="--link", hint=f"{robot} has links 1..{len(chain)} that move")
-    number = 0 if chain is None else link % (len(chain) + 1)
+    number = 0 if chain is None else carrier % (len(chain) + 1)
+    motion: LinkMotion
+    measured: Measurement
+    delay: float | None
     wanted = {"auto": None, "yes": True, "no": False}[offsets]
     if wanted and chain is None:
         raise InputError("needs the arm's joints.", field="--offsets", hint="give --robot NAME with its joints")
     if board is not None:
         if joints is not None or poses is not None:
             raise InputError("goes without --board.", field="--joints, --poses", hint="joints come with the images")
-        motion, measured = _board_problem(source, board, chain, number, camera, eye_to_hand, max_views, quiet)
-        found = calibrate_hand_eye(motion, measured, offsets=wanted)
+        motion, measured = _board_problem(source, board, robot, chain, number, camera, eye_to_hand, max_views, quiet)
+        delay = None
     else:
         if eye_to_hand or camera is not None:
             raise InputError("needs --board.", field="--eye-to-hand, --camera", hint="give --board, or leave it out")
-        motion, tracked, delay = _tracked_problem(source, chain, number, joints, poses, same_clock)
-        found = calibrate_hand_eye(motion, tracked, offsets=wanted, delay=delay)
+        motion, measured, delay = _tracked_problem(source, robot, chain, number, joints, poses, same_clock)
+    if chain is None and out is not None and link is None and not eye_to_hand:
+        hint = "give the link whose frame the recorded poses are of (-1: the last), or --robot NAME with joints"
+        raise InputError("is not known without a robot.", field="--link", hint=hint)
+    found = calibrate_hand_eye(motion, measured, offsets=wanted, delay=delay)
     if not quiet:
         _print(found, source, eye_to_hand, board is not None)
-    if found.refusal:
-        hint = "turn the link about two axes or more, by 20 degrees or more, in 15 views or more"
-        raise InputError(f"is not determined: {found.refusal}.", file=source, field="pose on the link", hint=hint)
+    found.check(moving=not eye_to_hand, static=eye_to_hand or board is None)
     if out is not None:
-        _write(found, out, link, eye_to_hand, tracked=board is None)
+        joint_count = 0 if chain is None else len(chain)
+        _write(found, out, carrier, eye_to_hand, tracked=board is None, joints=joint_count)
     return 0
+
+
+def _require(found: IntrinsicsCalibration, source: str) -> None:
+    """Check that the views determine each value of a camera.
+
+    Raises:
+        InputError: they do not.
+    """
+    from splatbot.errors import InputError
+
+    for name, estimate in found.estimates.items():
+        if estimate.refusal:
+            hint = "take more images, with the board tilted by 20 to 40 degrees and up to the corners of the image"
+            raise InputError(f"is not determined: {estimate.refusal}.", file=source, field=name, hint=hint)
 
 
 def _value(estimate: Estimate) -> str:
@@ -175,7 +193,7 @@ def _detect(
         raise InputError(f"is {max_views}.", field="--max-views", hint="give 20 to 200")
     found: list[tuple[ArmView, BoardView]] = []
     sizes: set[tuple[int, int]] = set()
-    refusal = None
+    refusal, misses = None, 0
     with shares(quiet) as show:
         for share, arm, image in read_views(source, max_views=max_views):
             show("board", share)
@@ -189,6 +207,9 @@ def _detect(
                     spec = spec.completed(image)
                 except InputError as error:  # the board may be in a later image
                     refusal = error
+                    misses += 1
+                    if misses == _MOST_MISSES:
+                        break
                     continue
             found.append((arm, spec.detect(image)))
     if refusal is not None and not found:
@@ -201,6 +222,7 @@ def _detect(
 def _board_problem(
     source: str,
     board: str,
+    robot: str | None,
     chain: KinematicChain | None,
     link: int,
     camera: str | None,
@@ -211,31 +233,50 @@ def _board_problem(
     """Return the motion of the link and the corners of all images that show the board and know the arm."""
     import numpy as np
 
-    from splatbot.calibration.board import MIN_CORNERS
     from splatbot.calibration.intrinsics import calibrate_intrinsics
-    from splatbot.calibration.link_motion import JointLinkMotion, PoseLinkMotion
+    from splatbot.calibration.link_motion import JointLinkMotion, PoseLinkMotion, check_joints
     from splatbot.calibration.measurements import BoardMeasurement
     from splatbot.errors import InputError
 
     found, size = _detect(source, board, max_views, quiet)
-    seen = [(view, corners) for view, corners in found if len(corners) >= MIN_CORNERS]
+    seen = [(view, corners) for view, corners in found if corners.usable]
     if camera is None:
-        lens = calibrate_intrinsics([corners for _, corners in seen], size).camera
+        intrinsics = calibrate_intrinsics([corners for _, corners in seen], size)
+        _require(intrinsics, source)
+        lens = intrinsics.camera
     else:
         lens = _camera(camera, size)
     motion: LinkMotion
     if chain is not None:
-        usable = [(v, c) for v, c in seen if v.joints is not None and len(v.joints) >= len(chain)]
-        motion = JointLinkMotion(
-            chain, np.array([v.joints[: len(chain)] for v, _ in usable if v.joints is not None]), link
-        )
+        usable = [(arm, c) for arm, c in seen if arm.joints is not None]
+        joints = _rows([arm.joints for arm, _ in usable if arm.joints is not None], source)
+        if usable:
+            check_joints(chain, joints, robot=robot or "", file=source)
+        motion = JointLinkMotion(chain, joints[:, : len(chain)], link)
     else:
-        usable = [(v, c) for v, c in seen if v.T_base_link is not None]
-        motion = PoseLinkMotion(np.array([v.T_base_link for v, _ in usable]))
+        usable = [(arm, c) for arm, c in seen if arm.T_base_link is not None]
+        motion = PoseLinkMotion(np.array([arm.T_base_link for arm, _ in usable]))
     if not usable:
         hint = "give --robot NAME and joints with the images" if chain is None else "write joint_values: [q1, ...]"
         raise InputError("does not say where the arm was.", file=source, field="joints", hint=hint)
     return motion, BoardMeasurement(tuple(c for _, c in usable), lens, not eye_to_hand)
+
+
+def _rows(joints: list[Array], source: str) -> Array:
+    """Return joint positions (V, J) of as many joints in each view.
+
+    Raises:
+        InputError: they differ in number.
+    """
+    import numpy as np
+
+    from splatbot.errors import InputError
+
+    counts = {len(q) for q in joints}
+    if len(counts) > 1:
+        hint = "write all joints for each image"
+        raise InputError(f"has {min(counts)} to {max(counts)} joints.", file=source, field="joints", hint=hint)
+    return np.array(joints).reshape(len(joints), -1)
 
 
 def _camera(name: str, size: tuple[int, int]) -> Camera:
@@ -256,6 +297,7 @@ def _camera(name: str, size: tuple[int, int]) -> Camera:
 
 def _tracked_problem(
     source: str,
+    robot: str | None,
     chain: KinematicChain | None,
     link: int,
     joints: Path | None,
@@ -263,6 +305,7 @@ def _tracked_problem(
     same_clock: bool,
 ) -> tuple[LinkMotion, PoseMeasurement, float | None]:
     """Return the motion of the link, the tracked poses, and the time offset that the stamps of the motion lack."""
+    from splatbot.calibration.link_motion import check_joints
     from splatbot.calibration.streams import align_streams, load_stream
     from splatbot.errors import InputError
     from splatbot.logs.joints import NAME, JointRecord
@@ -280,6 +323,7 @@ def _tracked_problem(
         if chain is None:
             raise InputError("needs the arm of the joints.", file=joints, field="--robot", hint="give --robot NAME")
         record = JointRecord(joints)
+        check_joints(chain, record.joints, robot=robot or "", file=str(joints))
         return align_streams(
             tracked, record.stamps, joints=record.joints, chain=chain, link=link, same_clock=same_clock
         )
@@ -296,10 +340,10 @@ def _print(found: HandEyeCalibration, source: str, eye_to_hand: bool, board: boo
     )
     if not board:
         static = "map in the base"
-    rows = [*_pose_rows(moving, found.T_link_moving, found.sigma_moving)]
-    rows += _pose_rows(static, found.T_base_static, found.sigma_static)
+    rows = [*_pose_rows(moving, found.T_link_moving, found.covariance_moving)]
+    rows += _pose_rows(static, found.T_base_static, found.covariance_static)
     for name, estimate in found.offsets.items():
-        value = f"{1e3 * estimate.value:+.1f} ± {1e3 * estimate.sigma:.1f} mrad"
+        value = f"{1e3 * estimate.value:+.1f} ± {1e3 * estimate.sigma:.1f} m{estimate.unit}"
         rows.append((name, f"not known: {estimate.refusal}" if estimate.refusal else value))
     if found.delay is not None:
         value = f"{1e3 * found.delay.value:.1f} ± {1e3 * found.delay.sigma:.1f} ms"
@@ -311,20 +355,21 @@ def _print(found: HandEyeCalibration, source: str, eye_to_hand: bool, board: boo
     print_table(rows, title=f"{source}: hand-eye")
 
 
-def _pose_rows(name: str, T: Array, sigma: Array) -> list[tuple[str, str]]:
+def _pose_rows(name: str, T: Array, covariance: Array) -> list[tuple[str, str]]:
     """Return a pose with its standard deviations in millimetres and degrees."""
     import numpy as np
 
     from splatbot.geometry import so3_log
 
-    shift = ", ".join(f"{1e3 * x:.1f} ± {1e3 * s:.1f}" for x, s in zip(T[:3, 3], sigma[:3], strict=True))
-    turn = ", ".join(
-        f"{x:.2f} ± {s:.2f}" for x, s in zip(np.degrees(so3_log(T[:3, :3])), np.degrees(sigma[3:]), strict=True)
-    )
-    return [(name, f"{shift} mm"), ("", f"{turn} degrees (rotation vector)")]
+    R = T[:3, :3]
+    sigma = np.sqrt(np.diag(R @ covariance[:3, :3] @ R.T))  # along the axes of the parent frame, as the translation
+    shift = ", ".join(f"{1e3 * x:.1f} ± {1e3 * s:.1f}" for x, s in zip(T[:3, 3], sigma, strict=True))
+    turn = ", ".join(f"{x:.2f}" for x in np.degrees(so3_log(R)))
+    largest = np.degrees(np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1]))
+    return [(name, f"{shift} mm"), ("", f"{turn} degrees (rotation vector), ± {largest:.2f} about any axis")]
 
 
-def _write(found: HandEyeCalibration, path: Path, link: int, eye_to_hand: bool, tracked: bool) -> None:
+def _write(found: HandEyeCalibration, path: Path, link: int, eye_to_hand: bool, *, tracked: bool, joints: int) -> None:
     """Write the estimates into a scene.yaml."""
     import numpy as np
 
@@ -338,6 +383,7 @@ def _write(found: HandEyeCalibration, path: Path, link: int, eye_to_hand: bool, 
         scene = replace(scene, T_link_camera=found.T_link_moving, camera_link=link)
     if tracked:
         scene = replace(scene, T_world_base=inverse(found.T_base_static))
-    offsets = found.joint_offsets
+    offsets = np.zeros(joints)
+    offsets[: len(found.joint_offsets)] = found.joint_offsets
     scene = replace(scene, joint_offsets=offsets if np.any(offsets) else None)
     scene.save(path)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from splatbot.calibration.board import BoardView, CharucoBoard
 from splatbot.calibration.hand_eye import calibrate_hand_eye, closed_form
 from splatbot.calibration.intrinsics import calibrate_intrinsics
-from splatbot.calibration.link_motion import JointLinkMotion, PoseLinkMotion, link_poses
+from splatbot.calibration.link_motion import JointLinkMotion, PoseLinkMotion, check_joints, link_poses
 from splatbot.calibration.measurements import BoardMeasurement, PoseMeasurement, project
 from splatbot.calibration.views import read_views
 from splatbot.camera import Camera
@@ -153,6 +153,62 @@ def test_without_a_refused_offset_the_pose_on_the_link_is_that_of_the_written_of
     assert any(e.refusal for e in list(found.offsets.values())[1:-1])
     predicted = inverse(found.T_base_static) @ link_poses(CHAIN, q + found.joint_offsets, 7) @ found.T_link_moving
     assert 1e3 * np.median(np.linalg.norm(predicted[:, :3, 3] - T[:, :3, 3], axis=1)) == pytest.approx(found.error)
+
+
+def test_offsets_that_trade_off_are_covered_by_their_standard_deviations() -> None:
+    """Axes 3 and 5 are nearly parallel while joint 4 is near 0: only the sum of their offsets is determined."""
+    rng = np.random.default_rng(5)
+    q = panda().home + rng.uniform(-0.6, 0.6, (60, 7))
+    q[:, 3] = -0.1 + rng.uniform(-0.01, 0.01, 60)
+    truth = np.array([0.0, 0.0, 0.010, 0.0, -0.010, 0.0, 0.0])
+    T = link_poses(CHAIN, q + truth, 7) @ X
+    T = np.array([t @ se3_exp(rng.normal(0, 0.002, 6)) for t in T])
+    found = calibrate_hand_eye(JointLinkMotion(CHAIN, q, 7), PoseMeasurement(T), offsets=True)
+    for estimate, value in zip(found.offsets.values(), truth, strict=True):
+        assert estimate.refusal or abs(estimate.value - value) < 3 * estimate.sigma
+    assert (np.abs(pose_error(found.T_link_moving, X)) < 3 * found.sigma_moving).all()
+
+
+@pytest.mark.parametrize("error", [0.0002, 0.005])
+def test_standard_deviations_of_boards_cover_the_errors_of_a_good_and_of_a_bad_arm(error: float) -> None:
+    """NEES of X, six degrees of freedom on average, for arms that err by 0.2 and 5 mm and milliradians."""
+    values = []
+    for seed in range(6):
+        q, measured, _ = seen_board(16, np.zeros(7), 30 + seed, eye_in_hand=True)
+        rng = np.random.default_rng(seed)
+        F = link_poses(CHAIN, q, 7)
+        F = np.array([f @ se3_exp(rng.normal(0, error, 6)) for f in F])
+        found = calibrate_hand_eye(PoseLinkMotion(F), measured)
+        values.append(np.mean((pose_error(found.T_link_moving, X) / found.sigma_moving) ** 2))
+    assert 0.2 < np.mean(values) < 2.5
+
+
+def test_inverted_poses_and_a_wrong_square_are_refused() -> None:
+    q, measured, _ = seen_board(20, np.zeros(7), 2, eye_in_hand=True)
+    F = link_poses(CHAIN, q, 7)
+    double = tuple(BoardView(2 * view.points, view.pixels) for view in measured.views)
+    for motion, seen in (
+        (PoseLinkMotion(np.array([inverse(f) for f in F])), measured),
+        (PoseLinkMotion(F), replace(measured, eye_in_hand=False)),
+        (PoseLinkMotion(F), replace(measured, views=double)),
+    ):
+        with pytest.raises(InputError, match="disagree by") as caught:
+            calibrate_hand_eye(motion, seen).check(moving=True, static=False)
+        assert "side of a square" in str(caught.value.hint)
+
+
+@pytest.mark.parametrize(
+    ("joints", "message"),
+    [
+        (np.zeros((3, 6)), "has 6 joints, panda has 7"),
+        (np.full((3, 7), np.nan), "not finite"),
+        (np.degrees(np.tile(panda().home, (3, 1))), "its limits are"),
+    ],
+)
+def test_joints_that_cannot_be_those_of_the_arm_are_refused(joints: Array, message: str) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        check_joints(CHAIN, joints, robot="panda", file="joints.txt")
+    assert caught.value.hint
 
 
 def test_turns_about_one_axis_only_are_refused() -> None:

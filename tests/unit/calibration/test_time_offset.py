@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 
 from splatbot.calibration.hand_eye import calibrate_hand_eye
 from splatbot.calibration.streams import align_streams, load_stream
@@ -19,9 +20,10 @@ Array = NDArray[np.float64]
 
 
 def motion(times: Array, seed: int = 0) -> Array:
-    rng = np.random.default_rng(seed)
-    rates, phases = rng.uniform(0.3, 2.0, 6), rng.uniform(0, 6, 6)
-    return np.stack([se3_exp(0.5 * np.sin(rates * t + phases)) for t in times])
+    """Return poses (N, 4, 4) of a smooth motion that does not repeat within 70 s."""
+    knots = np.arange(-2.0, 72.0, 0.7)
+    twists = CubicSpline(knots, np.random.default_rng(seed).normal(0, 0.4, (len(knots), 6)))(times)
+    return np.stack([se3_exp(xi) for xi in twists])
 
 
 @pytest.mark.parametrize(("delay", "epoch"), [(0.0, 0.0), (0.137, 0.0), (-2.5, 0.0), (0.0213, 1.5e9), (-40.0, 1e6)])
@@ -41,6 +43,22 @@ def test_motions_that_are_unrelated_or_at_rest_are_refused() -> None:
     for other in (motion(t, 2), motion(t, 3), rest):
         with pytest.raises(InputError, match="do not agree"):
             cross_correlate(t, motion(t, 0), t, other)
+
+
+def test_a_motion_that_repeats_leaves_a_doubt_that_is_named() -> None:
+    t = np.arange(0, 40, 0.02)
+    cycle = motion(t % 4.0, 3)
+    with pytest.raises(InputError, match="the motion repeats") as caught:
+        cross_correlate(t, cycle, t[500:1500], cycle[500:1500])
+    assert "--same-clock" in str(caught.value.hint)
+
+
+def test_rest_before_and_after_the_motion_does_not_hide_the_delay() -> None:
+    t = np.arange(0, 60, 0.02)
+    moving = np.clip(t, 20, 40)
+    rng = np.random.default_rng(0)
+    a, b = (np.array([T @ se3_exp(rng.normal(0, 1e-4, 6)) for T in motion(moving)]) for _ in range(2))
+    assert cross_correlate(t + 0.3, a, t, b) == pytest.approx(0.3, abs=0.003)
 
 
 def test_short_and_endless_recordings_are_refused() -> None:

@@ -103,7 +103,7 @@ def test_two_pose_files_of_one_motion_give_the_hand_eye_pose_and_the_time_offset
     with zipfile.ZipFile(data_root / "hand_eye_time_offset" / "robot_arm_w_color_camera_real.zip") as archive:
         archive.extractall(tmp_path)
     (arm,), (camera,) = (list(tmp_path.rglob(f"*{name}.csv")) for name in ("sr300_hinge", "target_ir"))
-    answer = run("calibrate", "hand-eye", camera, "--poses", arm, "--out", tmp_path / "scene.yaml")
+    answer = run("calibrate", "hand-eye", camera, "--poses", arm, "--link", "-1", "--out", tmp_path / "scene.yaml")
     assert answer.code == 0
     assert re.search(r"time offset +-1[67]\.\d ± \d\.\d ms", answer.out)
     written = Workspace.load(tmp_path / "scene.yaml")
@@ -122,6 +122,8 @@ def test_two_pose_files_of_one_motion_give_the_hand_eye_pose_and_the_time_offset
         (("{images}", "--board", BOARD, "--offsets", "yes"), "--offsets"),
         (("{images}", "--board", BOARD, "--poses", "x.txt"), "--joints, --poses"),
         (("{images}", "--board", BOARD, "--max-views", "0"), "--max-views"),
+        (("{images}", "--board", BOARD), "--link"),
+        (("{images}", "--board", BOARD, "--robot", "ur5e"), "disagree"),
         (("{images}", "--board", BOARD, "--max-views", "4"), "views"),
         (("{empty}", "--board", BOARD), "empty"),
         (("nowhere", "--board", BOARD), "nowhere"),
@@ -145,6 +147,8 @@ def test_wrong_input_of_hand_eye_is_named_and_no_scene_is_written(
     "text",
     [
         "[1, 2",
+        "T_base_link: [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0.3, 0, 0.5, 1]]",
+        "T_base_link: [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]]",
         "joint_values: [1, nan]",
         "joint_values: far",
         "T_base_link: [[1, 2], [3, 4]]",
