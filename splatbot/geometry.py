@@ -51,6 +51,12 @@ def rotation_angles(R: Array) -> Array:
     return np.asarray(np.arctan2(sine, 0.5 * (np.trace(R, axis1=1, axis2=2) - 1)))
 
 
+def nearest_rotation(M: ArrayLike) -> Array:
+    """Return the rotation (3, 3) nearest to a matrix (3, 3) in the Frobenius norm (Umeyama 1991)."""
+    U, _, Vt = np.linalg.svd(np.asarray(M, dtype=np.float64))
+    return np.asarray(U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt)
+
+
 def se3_exp(xi: ArrayLike) -> Array:
     """Return the pose (4, 4) of a twist (6,) = (translation [m], rotation [rad]) (Barfoot 2017, eq. 7.85)."""
     x = np.asarray(xi, dtype=np.float64)

@@ -211,7 +211,9 @@ def fit_workspace(model: GaussianModel, *, up: ArrayLike = (0.0, -1.0, 0.0), see
     best, best_score, count = np.zeros(4), 0.0, 0
     trios = some[rng.integers(0, len(some), (CONSTANTS.ransac_trials, 3))]
     for some_trios in np.array_split(trios, max(1, len(trios) // 250)):  # 8 MB of distances at a time
-        planes = _through_trios(some_trios, upward)
+        normals = np.cross(some_trios[:, 1] - some_trios[:, 0], some_trios[:, 2] - some_trios[:, 0])
+        planes = _planes(normals, some_trios[:, 0], upward)
+        planes = planes[planes[:, 3] > 0.0]  # below the first camera
         inliers = (np.abs(planes[:, :3] @ some.T + planes[:, 3:]) < CONSTANTS.inlier_distance).sum(axis=1)
         scores = inliers * (planes[:, :3] @ upward) ** CONSTANTS.tilt_exponent
         if len(scores) and scores.max() > best_score:
@@ -222,30 +224,17 @@ def fit_workspace(model: GaussianModel, *, up: ArrayLike = (0.0, -1.0, 0.0), see
     for _ in range(5):  # least squares on the inliers
         on = points[np.abs(points @ best[:3] + best[3]) < CONSTANTS.inlier_distance]
         middle = on.mean(axis=0)
-        refined = _through(np.linalg.svd(on - middle, full_matrices=False)[2][2], middle, upward)
-        best = best if refined is None else refined
+        best = _planes(np.linalg.svd(on - middle, full_matrices=False)[2][2:], middle[None], upward)[0]
     return _around(best, points[np.abs(points @ best[:3] + best[3]) < CONSTANTS.inlier_distance])
 
 
-def _through_trios(trios: Array, up: Array) -> Array:
-    """Return the planes (M, 4) below the first camera through three points each (N, 3, 3), M <= N."""
-    normals = np.cross(trios[:, 1] - trios[:, 0], trios[:, 2] - trios[:, 0])
+def _planes(normals: Array, points: Array, up: Array) -> Array:
+    """Return the planes (M, 4) through points (N, 3) with normals (N, 3), turned upwards; zero normals have none."""
     lengths = np.linalg.norm(normals, axis=1)
     firm = lengths > _LEAST_NORMAL
     n = normals[firm] / lengths[firm, None]
     n *= np.where(n @ up < 0, -1.0, 1.0)[:, None]
-    d = -(n * trios[firm, 0]).sum(axis=1)
-    return np.column_stack([n, d])[d > 0.0]
-
-
-def _through(normal: Array, point: Array, up: Array) -> Array | None:
-    """Return the plane (4,) through a point with its normal upwards, or None for collinear points."""
-    length = float(np.linalg.norm(normal))
-    if length < _LEAST_NORMAL:
-        return None
-    n = normal / length
-    n = -n if n @ up < 0 else n
-    return np.append(n, -float(n @ point))
+    return np.column_stack([n, -(n * points[firm]).sum(axis=1)])
 
 
 def _around(plane: Array, on: Array) -> Workspace:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from splatbot.errors import FormatError, InputError
-from splatbot.geometry import inverse, so3_log
+from splatbot.geometry import inverse, nearest_rotation, so3_log
 from splatbot.logs.calibration import read_object
 from splatbot.logs.joints import JointRecord, find_joints
 from splatbot.protocols import Array
@@ -172,9 +172,8 @@ def base_in_map(T_base_camera: Mapping[int, Array], T_world_camera: Mapping[int,
 
 
 def _between(theirs: Array, ours: Array) -> Array:
-    U, _, Vt = np.linalg.svd((ours[:, :3, :3] @ theirs[:, :3, :3].transpose(0, 2, 1)).sum(axis=0))
     T = np.eye(4)
-    T[:3, :3] = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
+    T[:3, :3] = nearest_rotation((ours[:, :3, :3] @ theirs[:, :3, :3].transpose(0, 2, 1)).sum(axis=0))
     T[:3, 3] = (ours[:, :3, 3] - theirs[:, :3, 3] @ T[:3, :3].T).mean(axis=0)
     return T
 

@@ -25,7 +25,7 @@ from splatbot.calibration.estimate import Estimate
 from splatbot.calibration.link_motion import LinkMotion
 from splatbot.calibration.measurements import Measurement
 from splatbot.errors import InputError
-from splatbot.geometry import inverse, se3_exp
+from splatbot.geometry import inverse, nearest_rotation, se3_exp
 
 Array = NDArray[np.float64]
 
@@ -40,6 +40,8 @@ class HandEyeConstants:
     """Standard deviation [rad or m] of the prior of a joint offset. Recorded arms err by up to 17 mrad."""
     delay_prior: float = 1.0
     """Standard deviation [s] of the prior of the time offset, around the one of the cross-correlation."""
+    offset_gain: float = 0.9
+    """Largest held-out error with joint offsets, as a share [1] of that without, for which they are estimated."""
     largest_offset_sigma: float = 0.005
     """Largest standard deviation [rad or m] of a useful joint offset: that of a person's own adjustment."""
     largest_delay_sigma: float = 0.005
@@ -160,10 +162,13 @@ def calibrate_hand_eye(
     """
     if len(motion) < MIN_VIEWS:
         raise InputError(f"has {len(motion)} usable views.", field="views", hint=f"give {MIN_VIEWS} or more")
-    choices = [False] if not motion.offsets else [False, True] if offsets is None else [False, True][: 1 + offsets]
-    held_out = [_held_out_error(motion, measured, choice, delay) for choice in choices]
-    use = len(choices) == 2 and (offsets is True or held_out[1] < 0.9 * held_out[0])
-    free, refused = _free_offsets(motion, use), dict[str, Estimate]()
+    # The first joint turns the base, the last one the hand: see UNKNOWABLE.
+    free, refused = motion.offsets[1:-1] if offsets is not False else (), dict[str, Estimate]()
+    held_out = [_held_out_error(motion, measured, (), delay)]
+    if free:
+        held_out.append(_held_out_error(motion, measured, free, delay))
+        if offsets is None and held_out[1] > CONSTANTS.offset_gain * held_out[0]:
+            free = ()
     while True:
         model = _Model(motion, measured, free, delay)
         found = model.result(model.solve(), tuple(held_out), refused)
@@ -176,17 +181,11 @@ def calibrate_hand_eye(
         free = tuple(name for name in free if name != least)
 
 
-def _free_offsets(motion: LinkMotion, wanted: bool) -> tuple[str, ...]:
-    """Return the joints whose offsets views can determine; see :data:`UNKNOWABLE`."""
-    return motion.offsets[1:-1] if wanted else ()
-
-
-def _held_out_error(motion: LinkMotion, measured: Measurement, offsets: bool, delay: float | None) -> float:
+def _held_out_error(motion: LinkMotion, measured: Measurement, free: tuple[str, ...], delay: float | None) -> float:
     """Return the median error of every third block of views of a fit to the others."""
     rows = np.arange(len(motion))
     blocks = np.array_split(rows, min(len(rows), CONSTANTS.blocks))
     out = np.isin(rows, np.concatenate(blocks[:: CONSTANTS.held_out_every]))
-    free = _free_offsets(motion, offsets)
     fitted = _Model(motion.select(rows[~out]), measured.select(rows[~out]), free, delay)
     solution = fitted.solve()
     test = _Model(motion.select(rows[out]), measured.select(rows[out]), free, delay, start=(fitted.X, fitted.Y))
@@ -340,15 +339,13 @@ def closed_form(T_base_link: Array, T_static_moving: Array) -> tuple[Array, Arra
             field="motion",
             hint="turn the link about two axes or more between the views, by 20 degrees or more",
         )
-    U, _, Vt = np.linalg.svd(alpha[safe].T @ beta[safe])
-    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    R = nearest_rotation(alpha[safe].T @ beta[safe])
     left = (A[:, :3, :3] - np.eye(3)).reshape(-1, 3)
     right = (B[:, :3, 3] @ R.T - A[:, :3, 3]).reshape(-1)
     X, Y = np.eye(4), np.eye(4)
     X[:3, :3], X[:3, 3] = R, np.linalg.lstsq(left, right, rcond=None)[0]
     found = T_base_link @ X @ np.stack([inverse(T) for T in T_static_moving])
-    U, _, Vt = np.linalg.svd(found[:, :3, :3].sum(axis=0))
-    Y[:3, :3], Y[:3, 3] = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt, np.median(found[:, :3, 3], axis=0)
+    Y[:3, :3], Y[:3, 3] = nearest_rotation(found[:, :3, :3].sum(axis=0)), np.median(found[:, :3, 3], axis=0)
     return X, Y
 
 

@@ -18,6 +18,7 @@ Array = NDArray[np.float64]
 
 MIN_VIEWS = 6
 """Least number of views [1]: of fewer, one bad view changes the focal length by percents."""
+_UNITS = {"fx": "px", "fy": "px", "cx": "px", "cy": "px", "k1": "", "k2": "", "p1": "", "p2": "", "k3": ""}
 _LARGEST_SIGMA = 0.01  # [1] of the width of the image: by which a pixel at its corner may be off
 _LARGEST_RMS = 1 / 640  # [1] of the width of the image
 
@@ -39,6 +40,17 @@ class IntrinsicsCalibration:
     rms: float
     views: Array
     corners: int
+
+    def check(self) -> None:
+        """Check that the views determine each value.
+
+        Raises:
+            InputError: they do not.
+        """
+        for name, estimate in self.estimates.items():
+            if estimate.refusal:
+                hint = "take more images, with the board tilted by 20 to 40 degrees and up to the corners of the image"
+                raise InputError(f"is not determined: {estimate.refusal}.", field=name, hint=hint)
 
 
 def calibrate_intrinsics(views: Sequence[BoardView], size: tuple[int, int]) -> IntrinsicsCalibration:
@@ -64,22 +76,19 @@ def calibrate_intrinsics(views: Sequence[BoardView], size: tuple[int, int]) -> I
     rms, values, sigma, errors = _fit(chosen, size)
     halves = [_fit(chosen[k::2], size)[1] for k in (0, 1)]
     sigma = np.maximum(sigma, 0.5 * np.abs(halves[0] - halves[1]))
-    names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
-    corner = 0.5 * float(np.hypot(*size)) / values[0]  # [1] distance from the axis
-    reach = dict(zip(names, (corner, corner, 1.0, 1.0), strict=False))
-    reach |= {"k1": corner**3, "k2": corner**5, "k3": corner**7, "p1": 3 * corner**2, "p2": 3 * corner**2}
-    pixels = {name: (1.0 if name in ("fx", "fy", "cx", "cy") else values[0]) * r for name, r in reach.items()}
-    limits = {name: _LARGEST_SIGMA * size[0] / max(p, 1e-12) for name, p in pixels.items()}
     if rms > _LARGEST_RMS * size[0]:
         raise InputError(
             f"do not fit the model: {rms:.2f} px RMS.",
             field="views",
             hint="check the numbers of squares and the side of a square; the model is no fisheye lens",
         )
+    corner = 0.5 * float(np.hypot(*size)) / values[0]  # [1] distance from the axis
+    powers = np.array([corner**3, corner**5, 3 * corner**2, 3 * corner**2, corner**7])
+    displacement = np.concatenate([[corner, corner, 1.0, 1.0], values[0] * powers])  # [px] there, for a change of 1
     need = "tilt the board more against the image, and fill the corners of the image"
     estimates = {
-        name: Estimate.limited(float(v), float(s), "px" if name in ("fx", "fy", "cx", "cy") else "", limits[name], need)
-        for name, v, s in zip(names, values, sigma, strict=True)
+        name: Estimate.limited(float(v), float(s), unit, _LARGEST_SIGMA * size[0] / float(d), need)
+        for (name, unit), v, s, d in zip(_UNITS.items(), values, sigma, displacement, strict=True)
     }
     fx, fy, cx, cy, *distortion = (float(value) for value in values)
     camera = Camera(fx, fy, cx, cy, *size, tuple(distortion))

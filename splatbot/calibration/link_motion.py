@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Protocol
 
@@ -10,16 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
+from splatbot.collision import RobotSpheres
 from splatbot.errors import InputError
-from splatbot.protocols import KinematicChain
+from splatbot.protocols import RobotKinematics
 
 Array = NDArray[np.float64]
 
 _BEYOND = 0.2  # [rad or m] beyond its limits that a measured joint position may be
+_AROUND = 2.0  # [s] of a record before and after the views that are kept
 
 
 class LinkMotion(Protocol):
-    """Poses of a link at the times of the views."""
+    """Poses of a link: one for each view, or recorded over time and interpolated at the times of the views."""
 
     @property
     def offsets(self) -> tuple[str, ...]:
@@ -31,10 +33,19 @@ class LinkMotion(Protocol):
         """Unit of each offset: "rad" or "m"."""
         ...
 
+    @property
+    def stamps(self) -> Array | None:
+        """Times (N,) of the record [s], None if there is one pose for each view."""
+        ...
+
     def __len__(self) -> int: ...
 
     def poses(self, offsets: Array, delay: float) -> Array:
-        """Compute T_base_link (V, 4, 4) with joint offsets (J,) [rad or m], ``delay`` [s] after the stamps."""
+        """Compute T_base_link (V, 4, 4) with joint offsets (J,) [rad or m], ``delay`` [s] after the views."""
+        ...
+
+    def seen_at(self, views: Array, delay: float) -> LinkMotion:
+        """Return the motion at views (V,) [s], when the stamps of the record are ``delay`` [s] ahead of those."""
         ...
 
     def select(self, rows: NDArray[np.intp]) -> LinkMotion:
@@ -47,44 +58,50 @@ class JointLinkMotion:
     """Motion of a link by its joints.
 
     Args:
-        chain: joints of the arm.
+        arm: kinematics of the arm.
         joints: (N, J) joint positions [rad or m].
         link: index of the link, 1 to J.
-        stamps: (N,) times of the joint positions [s] near 0; None if each row belongs to one view.
-        at: (V,) times of the views [s].
+        stamps: (N,) times of the joint positions [s]; None if each row belongs to one view.
+        views: (V,) times of the views [s]; None before :meth:`seen_at`.
     """
 
-    chain: KinematicChain
+    arm: RobotSpheres
     joints: Array
     link: int
     stamps: Array | None = None
-    at: Array | None = None
+    views: Array | None = None
 
     @property
     def offsets(self) -> tuple[str, ...]:
         """Names of the joints before the link."""
-        return self.chain.names[: self.link]
+        return self.arm.robot.chain.names[: self.link]
 
     @property
     def units(self) -> tuple[str, ...]:
         """Unit of each offset."""
-        return tuple("m" if prismatic else "rad" for prismatic in self.chain.prismatic[: self.link])
+        return tuple("m" if prismatic else "rad" for prismatic in self.arm.robot.chain.prismatic[: self.link])
 
     def __len__(self) -> int:
-        return len(self.joints if self.at is None else self.at)
+        return len(self.joints if self.views is None else self.views)
 
     def poses(self, offsets: Array, delay: float) -> Array:
         """Implement :class:`LinkMotion`."""
-        q = self.joints
-        if self.stamps is not None and self.at is not None:
-            q = np.column_stack([np.interp(self.at + delay, self.stamps, column) for column in self.joints.T])
-        return link_poses(self.chain, q[:, : self.link] + offsets, self.link)
+        q = self.joints.copy()
+        if self.stamps is not None and self.views is not None:
+            q = np.column_stack([np.interp(self.views + delay, self.stamps, column) for column in self.joints.T])
+        q[:, : self.link] += offsets
+        return np.asarray(self.arm.forward(q)[:, self.link])
+
+    def seen_at(self, views: Array, delay: float) -> JointLinkMotion:
+        """Implement :class:`LinkMotion`."""
+        near, stamps, times = _relative_times(self.stamps, views, delay)
+        return replace(self, joints=self.joints[near], stamps=stamps, views=times)
 
     def select(self, rows: NDArray[np.intp]) -> JointLinkMotion:
         """Implement :class:`LinkMotion`."""
-        if self.at is None:
-            return JointLinkMotion(self.chain, self.joints[rows], self.link)
-        return JointLinkMotion(self.chain, self.joints, self.link, self.stamps, self.at[rows])
+        if self.views is None:
+            return replace(self, joints=self.joints[rows])
+        return replace(self, views=self.views[rows])
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,32 +110,24 @@ class PoseLinkMotion:
 
     Args:
         T_base_link: (N, 4, 4) [m].
-        stamps: (N,) times of the poses [s] near 0; None if each pose belongs to one view.
-        at: (V,) times of the views [s].
+        stamps: (N,) times of the poses [s]; None if each pose belongs to one view.
+        views: (V,) times of the views [s]; None before :meth:`seen_at`.
     """
 
     T_base_link: Array
     stamps: Array | None = None
-    at: Array | None = None
-
-    @property
-    def offsets(self) -> tuple[str, ...]:
-        """No names: the joints are not known."""
-        return ()
-
-    @property
-    def units(self) -> tuple[str, ...]:
-        """No units."""
-        return ()
+    views: Array | None = None
+    offsets: tuple[str, ...] = ()
+    units: tuple[str, ...] = ()
 
     def __len__(self) -> int:
-        return len(self.T_base_link if self.at is None else self.at)
+        return len(self.T_base_link if self.views is None else self.views)
 
     def poses(self, offsets: Array, delay: float) -> Array:
         """Implement :class:`LinkMotion`."""
-        if self.stamps is None or self.at is None:
+        if self.stamps is None or self.views is None:
             return self.T_base_link
-        times = np.clip(self.at + delay, self.stamps[0], self.stamps[-1])
+        times = np.clip(self.views + delay, self.stamps[0], self.stamps[-1])
         T = np.tile(np.eye(4), (len(times), 1, 1))
         T[:, :3, :3] = self._rotations(times).as_matrix()
         T[:, :3, 3] = np.column_stack([np.interp(times, self.stamps, x) for x in self.T_base_link[:, :3, 3].T])
@@ -128,26 +137,41 @@ class PoseLinkMotion:
     def _rotations(self) -> Any:
         return Slerp(self.stamps, Rotation.from_matrix(self.T_base_link[:, :3, :3]))
 
+    def seen_at(self, views: Array, delay: float) -> PoseLinkMotion:
+        """Implement :class:`LinkMotion`."""
+        near, stamps, times = _relative_times(self.stamps, views, delay)
+        return replace(self, T_base_link=self.T_base_link[near], stamps=stamps, views=times)
+
     def select(self, rows: NDArray[np.intp]) -> PoseLinkMotion:
         """Implement :class:`LinkMotion`."""
-        return (
-            PoseLinkMotion(self.T_base_link[rows])
-            if self.at is None
-            else PoseLinkMotion(self.T_base_link, self.stamps, self.at[rows])
-        )
+        if self.views is None:
+            return replace(self, T_base_link=self.T_base_link[rows])
+        return replace(self, views=self.views[rows])
 
 
-def check_joints(chain: KinematicChain, joints: Array, *, robot: str, file: str) -> None:
+def _relative_times(stamps: Array | None, views: Array, delay: float) -> tuple[NDArray[np.bool_], Array, Array]:
+    """Return which rows of a record are near the views, their stamps, and the views, all from the first view on.
+
+    Differences of stamps like 1.7e9 s keep their microseconds only near 0.
+    """
+    if stamps is None:
+        raise InputError("has no stamps.", field="motion", hint="give the times of the record")
+    times, at = stamps - (views[0] + delay), views - views[0]
+    near = (times > -_AROUND) & (times < at[-1] + _AROUND)
+    return near, times[near], at
+
+
+def check_joints(robot: RobotKinematics, joints: Array, *, file: str) -> None:
     """Check that joint positions (N, >= J) [rad or m] can be those of an arm; columns of a gripper may follow.
 
     Raises:
         InputError: there are too few columns, a value is not finite, or a position is far beyond its limits.
     """
-    count = len(chain)
+    chain, count = robot.chain, len(robot.chain)
     if joints.ndim != 2 or joints.shape[1] < count:
         found = joints.shape[1] if joints.ndim == 2 else 0
         hint = "give the joints of this robot, or the robot of these joints"
-        raise InputError(f"has {found} joints, {robot} has {count}.", file=file, field="joints", hint=hint)
+        raise InputError(f"has {found} joints, {robot.name} has {count}.", file=file, field="joints", hint=hint)
     q = joints[:, :count]
     if not np.isfinite(q).all():
         raise InputError("has values that are not finite.", file=file, field="joints", hint="remove these lines")
@@ -159,19 +183,5 @@ def check_joints(chain: KinematicChain, joints: Array, *, robot: str, file: str)
             f"{chain.names[k]} is {worst:.4g}, its limits are {chain.lower[k]:.4g} to {chain.upper[k]:.4g}.",
             file=file,
             field="joints",
-            hint=f"give radians, in the order of the joints of {robot}: {', '.join(chain.names)}",
+            hint=f"give radians, in the order of the joints of {robot.name}: {', '.join(chain.names)}",
         )
-
-
-def link_poses(chain: KinematicChain, q: Array, link: int) -> Array:
-    """Compute T_base_link (V, 4, 4) of link ``link`` at joint positions (V, >= link) [rad or m]."""
-    T = np.tile(np.eye(4), (len(q), 1, 1))
-    for k in range(link):
-        step = np.tile(np.eye(4), (len(q), 1, 1))
-        if chain.prismatic[k]:
-            step[:, 2, 3] = q[:, k]
-        else:
-            c, s = np.cos(q[:, k]), np.sin(q[:, k])
-            step[:, 0, 0], step[:, 0, 1], step[:, 1, 0], step[:, 1, 1] = c, -s, s, c
-        T = T @ chain.T_before_joint[k] @ step
-    return T

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import cv2
@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from splatbot.calibration.board import BoardView
 from splatbot.camera import Camera
-from splatbot.geometry import inverse
+from splatbot.geometry import inverse, so3_exp, so3_log
 
 Array = NDArray[np.float64]
 
@@ -60,7 +60,7 @@ class BoardMeasurement:
         views: corners of the views.
         camera: camera with its distortion.
         eye_in_hand: whether the camera moves; else the board does.
-        sigma: standard deviation of a corner [px].
+        sigma: median magnitude of a coordinate's error, at least 1 px.
     """
 
     views: tuple[BoardView, ...]
@@ -93,8 +93,8 @@ class BoardMeasurement:
         return BoardMeasurement(tuple(self.views[k] for k in rows), self.camera, self.eye_in_hand, self.sigma)
 
     def scaled(self, residuals: list[Array]) -> BoardMeasurement:
-        """Return the measurement itself: Huber's loss covers errors above 1 px."""
-        return self
+        """Implement :class:`Measurement`: half of the errors of a bad arm exceed ``sigma``, and count linearly."""
+        return replace(self, sigma=max(1.0, self.sigma * float(np.median(np.abs(np.concatenate(residuals))))))
 
     def error(self, residuals: list[Array]) -> float:
         """Compute the median distance of a corner from its prediction [px]."""
@@ -154,13 +154,14 @@ def board_pose(view: BoardView, camera: Camera) -> Array:
     _, r, t = cv2.solvePnP(view.points, view.pixels, camera.K, distortion, flags=cv2.SOLVEPNP_IPPE)
     r, t = cv2.solvePnPRefineLM(view.points, view.pixels, camera.K, distortion, r, t)
     T = np.eye(4)
-    T[:3, :3], T[:3, 3] = Rotation.from_rotvec(r.reshape(3)).as_matrix(), t.reshape(3)
+    T[:3, :3], T[:3, 3] = so3_exp(r.reshape(3)), t.reshape(3)
     return T
 
 
 def project(points: Array, T_camera_board: Array, camera: Camera) -> Array:
     """Project points (N, 3) [m] of the board into the image: (N, 2) [px]."""
     distortion = np.array(camera.distortion) if camera.distortion else None
-    r = Rotation.from_matrix(T_camera_board[:3, :3]).as_rotvec()
-    pixels = cv2.projectPoints(points, r, T_camera_board[:3, 3].copy(), camera.K, distortion)[0]
+    pixels = cv2.projectPoints(
+        points, so3_log(T_camera_board[:3, :3]), T_camera_board[:3, 3].copy(), camera.K, distortion
+    )[0]
     return np.asarray(pixels, np.float64).reshape(-1, 2)

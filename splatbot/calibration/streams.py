@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 from numpy.typing import NDArray
 
-from splatbot.calibration.link_motion import JointLinkMotion, LinkMotion, PoseLinkMotion, link_poses
+from splatbot.calibration.link_motion import LinkMotion
 from splatbot.calibration.measurements import PoseMeasurement
 from splatbot.calibration.time_offset import cross_correlate
 from splatbot.errors import InputError
-from splatbot.formats.trajectory import load_trajectory
 from splatbot.logs.joints import MAX_GAP
-from splatbot.protocols import KinematicChain
 from splatbot.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -21,28 +17,11 @@ Array = NDArray[np.float64]
 MAX_POSES = 600
 """Largest number of tracked poses of a problem [1]; more change the result less than its standard deviation."""
 _SAME_INSTANT = 1e-6  # [s] between stamps of views that were recorded together
-_AROUND = 2.0  # [s] of the arm's record before and after the tracked poses that are kept
 _MAX_PERIOD = 0.2  # [s] of recordings whose time offset can be estimated
 
 
-def load_stream(path: Path) -> Trajectory:
-    """Read a pose file in any order; of equal stamps, the first pose is kept.
-
-    Raises:
-        FormatError: the file is missing or damaged.
-    """
-    return load_trajectory(path, unordered=True)
-
-
 def align_streams(
-    tracked: Trajectory,
-    stamps: Array,
-    *,
-    T_base_link: Array | None = None,
-    joints: Array | None = None,
-    chain: KinematicChain | None = None,
-    link: int = 0,
-    same_clock: bool = False,
+    tracked: Trajectory, arm: LinkMotion, *, same_clock: bool = False
 ) -> tuple[LinkMotion, PoseMeasurement, float | None]:
     """Return motion and measurement at the tracked poses for which the arm is known.
 
@@ -51,28 +30,24 @@ def align_streams(
 
     Args:
         tracked: tracked poses over time.
-        stamps: (N,) times of the arm [s].
-        T_base_link: (N, 4, 4) poses of the link, or None with ``joints`` (N, J), ``chain`` and ``link``.
-        joints, chain, link: see ``T_base_link``.
+        arm: motion of the link over time.
         same_clock: the stamps of both agree.
 
     Returns:
         Motion, measurement, and the time offset [s] that the stamps of the motion lack, None if both have one clock.
 
     Raises:
-        InputError: the recordings do not overlap, or their motions do not agree.
+        InputError: the arm has no stamps, the recordings do not overlap, or their motions do not agree.
     """
-    arm = T_base_link if joints is None or chain is None else link_poses(chain, joints, link)
-    if arm is None:
-        raise InputError("needs joints or poses.", field="motion")
-    periods = [float(np.median(np.diff(s))) if len(s) > 1 else np.inf for s in (tracked.stamps, stamps)]
-    delay = (
-        None
-        if same_clock or max(periods) > _MAX_PERIOD
-        else cross_correlate(stamps, arm, tracked.stamps, tracked.T_world_camera)
-    )
+    if arm.stamps is None:
+        raise InputError("has no stamps.", field="motion", hint="give the times of the record")
+    periods = [float(np.median(np.diff(s))) if len(s) > 1 else np.inf for s in (tracked.stamps, arm.stamps)]
+    delay = None
+    if not same_clock and max(periods) <= _MAX_PERIOD:
+        T_base_link = arm.poses(np.zeros(len(arm.offsets)), 0.0)
+        delay = cross_correlate(arm.stamps, T_base_link, tracked.stamps, tracked.T_world_camera)
     origin = float(tracked.stamps[0])
-    at, times = tracked.stamps - origin, stamps - (origin + (delay or 0.0))
+    at, times = tracked.stamps - origin, arm.stamps - (origin + (delay or 0.0))
     before = np.clip(np.searchsorted(times, at, side="right") - 1, 0, len(times) - 1)
     after = np.clip(np.searchsorted(times, at), 0, len(times) - 1)
     gap = np.maximum(np.abs(at - times[before]), np.abs(times[after] - at))
@@ -85,7 +60,4 @@ def align_streams(
         )
     rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MAX_POSES)).round().astype(int))]
     measured = PoseMeasurement(tracked.T_world_camera[rows])
-    near = (times > at[rows[0]] - _AROUND) & (times < at[rows[-1]] + _AROUND)
-    if joints is None or chain is None:
-        return PoseLinkMotion(arm[near], times[near], at[rows]), measured, delay
-    return JointLinkMotion(chain, joints[near], link, times[near], at[rows]), measured, delay
+    return arm.seen_at(tracked.stamps[rows], delay or 0.0), measured, delay

@@ -49,7 +49,7 @@ def calibrate_sensor_command(
     recording = open_log(log, camera=camera)
     found = calibrate_sensor(recording)
     if not quiet:
-        print_table([(name, _row(e)) for name, e in found.estimates.items()], title=f"{recording.name}: sensor")
+        print_table([(name, describe(e)) for name, e in found.estimates.items()], title=f"{recording.name}: sensor")
     if not found.known:
         refusals = "; ".join(f"{name}: {e.refusal}" for name, e in found.estimates.items())
         raise InputError(
@@ -64,9 +64,10 @@ def calibrate_sensor_command(
     return 0
 
 
-def _row(estimate: Estimate) -> str:
-    """Return an estimate with its standard deviation in milliseconds, millimetres or pixels, or its refusal."""
+def describe(estimate: Estimate) -> str:
+    """Return an estimate with its standard deviation, in thousandths of s, m and rad, or its refusal."""
     if estimate.refusal:
         return f"not known: {estimate.refusal}"
-    scale, unit = {"s": (1e3, "ms"), "m": (1e3, "mm")}.get(estimate.unit, (1.0, estimate.unit))
-    return f"{scale * estimate.value:.2f} ± {scale * estimate.sigma:.2f} {unit}"
+    scale, unit = (1e3, f"m{estimate.unit}") if estimate.unit in ("s", "m", "rad") else (1.0, estimate.unit)
+    digits = 2 if unit else 4
+    return f"{scale * estimate.value:.{digits}f} ± {scale * estimate.sigma:.{digits}f} {unit}".rstrip()

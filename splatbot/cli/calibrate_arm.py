@@ -8,19 +8,18 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from splatbot.cli.messages import print_message
+
 if TYPE_CHECKING:
-    from splatbot.calibration.board import BoardView
-    from splatbot.calibration.estimate import Estimate
     from splatbot.calibration.hand_eye import HandEyeCalibration
-    from splatbot.calibration.intrinsics import IntrinsicsCalibration
     from splatbot.calibration.link_motion import LinkMotion
     from splatbot.calibration.measurements import BoardMeasurement, Measurement, PoseMeasurement
-    from splatbot.calibration.views import ArmView
+    from splatbot.calibration.views import BoardRecording, ViewSource
     from splatbot.camera import Camera
-    from splatbot.protocols import Array, KinematicChain
+    from splatbot.protocols import Array, RobotKinematics
+    from splatbot.workspace import Workspace
 
 _MAX_VIEWS = 100
-_MOST_MISSES = 10  # images without the board before all others are given up: each is searched with all dictionaries
 
 
 def calibrate_intrinsics_command(
@@ -28,7 +27,7 @@ def calibrate_intrinsics_command(
     /,
     board: str,
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
-    depth_scale: float = 1000.0,
+    depth_scale: float | None = None,
     max_views: int = _MAX_VIEWS,
     quiet: bool = False,
 ) -> int:
@@ -46,25 +45,31 @@ def calibrate_intrinsics_command(
         views: folder of images, or a log.
         board: the board, as charuco:10x14:0.07:0.04.
         out: camera file to write; by default only the table is printed.
-        depth_scale: units of the depth images per metre, for the camera file.
+        depth_scale: units of the depth images per metre, for the camera file; by default those of the log, or 1000.
         max_views: largest number of images that are used, evenly spread.
         quiet: no progress and no table, only errors.
     """
     from splatbot.calibration.intrinsics import calibrate_intrinsics
+    from splatbot.calibration.views import ViewSource
+    from splatbot.cli.calibrate import describe
     from splatbot.cli.paths import check_output
     from splatbot.cli.tables import print_table
+    from splatbot.logs.base import MILLIMETRES
     from splatbot.logs.calibration import Calibration, save_calibration
 
     check_output(out, folder=False)
-    found, size = _detect(views, board, max_views, quiet)
-    result = calibrate_intrinsics([view for _, view in found], size)
+    source = ViewSource(views)
+    recording = _find_board(source, board, max_views, quiet)
+    width, height = recording.size
+    found = calibrate_intrinsics(recording.views, recording.size)
     if not quiet:
-        rows = [(name, _value(e)) for name, e in result.estimates.items()]
-        rows.append(("reprojection", f"{result.rms:.3f} px RMS, {result.corners:,} corners, {len(result.views)} views"))
-        print_table(rows, title=f"{views}: camera {size[0]}x{size[1]}")
-    _require(result, views)
+        rows = [(name, describe(estimate)) for name, estimate in found.estimates.items()]
+        rows.append(("reprojection", f"{found.rms:.3f} px RMS, {found.corners:,} corners, {len(found.views)} views"))
+        print_table(rows, title=f"{views}: camera {width}x{height}")
+    found.check()
     if out is not None:
-        save_calibration(Calibration(result.camera, depth_scale), out)
+        recorded = source.calibration or Calibration(found.camera, MILLIMETRES)
+        save_calibration(replace(recorded, camera=found.camera, depth_scale=depth_scale or recorded.depth_scale), out)
     return 0
 
 
@@ -118,112 +123,69 @@ def calibrate_hand_eye_command(
     """
     from splatbot.calibration.hand_eye import calibrate_hand_eye
     from splatbot.cli.paths import check_output
+    from splatbot.cli.progress import steps
     from splatbot.errors import InputError
     from splatbot.robots.store import load_robot
+    from splatbot.workspace import Workspace
 
     check_output(out, folder=False)
-    chain = None if robot is None else load_robot(robot).chain
-    carrier = -1 if link is None else link
-    if chain is not None and not (-len(chain) <= carrier <= len(chain) and carrier != 0):
-        raise InputError(f"is {link}.", field="--link", hint=f"{robot} has links 1..{len(chain)} that move")
-    number = 0 if chain is None else carrier % (len(chain) + 1)
+    scene = Workspace.load(out) if out is not None and out.exists() else Workspace()
+    arm = None if robot is None else load_robot(robot)
+    if arm is not None and link is not None and abs(link) > len(arm.chain):
+        raise InputError(f"is {link}.", field="--link", hint=f"{robot} has links 1..{len(arm.chain)} that move")
+    if link == 0:
+        raise InputError("is the base, which does not move.", field="--link", hint="give 1, 2, ..., or -1: the last")
+    wanted = {"auto": None, "yes": True, "no": False}[offsets]
+    if wanted and arm is None:
+        raise InputError("needs the arm's joints.", field="--offsets", hint="give --robot NAME with its joints")
     motion: LinkMotion
     measured: Measurement
-    delay: float | None
-    wanted = {"auto": None, "yes": True, "no": False}[offsets]
-    if wanted and chain is None:
-        raise InputError("needs the arm's joints.", field="--offsets", hint="give --robot NAME with its joints")
+    delay: float | None = None
+    carrier = -1 if link is None else link
     if board is not None:
-        if joints is not None or poses is not None:
-            raise InputError("goes without --board.", field="--joints, --poses", hint="joints come with the images")
-        motion, measured = _board_problem(source, board, robot, chain, number, camera, eye_to_hand, max_views, quiet)
-        delay = None
+        if joints is not None or poses is not None or same_clock:
+            hint = "leave them out: joints come with the images"
+            raise InputError("goes without --board.", field="--joints, --poses, --same-clock", hint=hint)
+        motion, measured = _board_problem(source, board, arm, carrier, camera, eye_to_hand, max_views, quiet)
     else:
         if eye_to_hand or camera is not None:
             raise InputError("needs --board.", field="--eye-to-hand, --camera", hint="give --board, or leave it out")
-        motion, measured, delay = _tracked_problem(source, robot, chain, number, joints, poses, same_clock)
-    if chain is None and out is not None and link is None and not eye_to_hand:
+        motion, measured, delay = _tracked_problem(source, arm, carrier, joints, poses, same_clock)
+    if arm is None and out is not None and link is None and not eye_to_hand:
         hint = "give the link whose frame the recorded poses are of (-1: the last), or --robot NAME with joints"
         raise InputError("is not known without a robot.", field="--link", hint=hint)
-    found = calibrate_hand_eye(motion, measured, offsets=wanted, delay=delay)
+    with steps(quiet) as show:
+        show("least squares")
+        found = calibrate_hand_eye(motion, measured, offsets=wanted, delay=delay)
     if not quiet:
         _print(found, source, eye_to_hand, board is not None)
     found.check(moving=not eye_to_hand, static=eye_to_hand or board is None)
     if out is not None:
-        joint_count = 0 if chain is None else len(chain)
-        _write(found, out, carrier, eye_to_hand, tracked=board is None, joints=joint_count)
+        _completed(scene, found, 0 if eye_to_hand else carrier, arm, tracked=board is None).save(out)
     return 0
 
 
-def _require(found: IntrinsicsCalibration, source: str) -> None:
-    """Check that the views determine each value of a camera.
-
-    Raises:
-        InputError: they do not.
-    """
-    from splatbot.errors import InputError
-
-    for name, estimate in found.estimates.items():
-        if estimate.refusal:
-            hint = "take more images, with the board tilted by 20 to 40 degrees and up to the corners of the image"
-            raise InputError(f"is not determined: {estimate.refusal}.", file=source, field=name, hint=hint)
-
-
-def _value(estimate: Estimate) -> str:
-    if estimate.refusal:
-        return f"not known: {estimate.refusal}"
-    return f"{estimate.value:.4g} ± {estimate.sigma:.2g} {estimate.unit}".rstrip()
-
-
-def _detect(
-    source: str, board: str, max_views: int, quiet: bool
-) -> tuple[list[tuple[ArmView, BoardView]], tuple[int, int]]:
-    """Return the arm at each image with the corners in it, and the size (width, height) of all of them.
-
-    Raises:
-        InputError: the images differ in size, or none shows the board.
-    """
+def _find_board(source: ViewSource, board: str, max_views: int, quiet: bool) -> BoardRecording:
+    """Return the views of a board, with progress and a note of damaged frames."""
     from splatbot.calibration.board import CharucoBoard
-    from splatbot.calibration.views import read_views
+    from splatbot.calibration.views import find_board
     from splatbot.cli.progress import shares
     from splatbot.errors import InputError
 
-    spec = CharucoBoard.parse(board)
     if max_views < 1:
         raise InputError(f"is {max_views}.", field="--max-views", hint="give 20 to 200")
-    found: list[tuple[ArmView, BoardView]] = []
-    sizes: set[tuple[int, int]] = set()
-    refusal, misses = None, 0
+    spec = CharucoBoard.parse(board)
     with shares(quiet) as show:
-        for share, arm, image in read_views(source, max_views=max_views):
-            show("board", share)
-            sizes.add((image.shape[1], image.shape[0]))
-            if len(sizes) > 1:
-                named = ", ".join(f"{w}x{h}" for w, h in sorted(sizes))
-                hint = "give images of one camera"
-                raise InputError(f"has images of {named}.", file=source, field="views", hint=hint)
-            if not spec.complete:
-                try:
-                    spec = spec.completed(image)
-                except InputError as error:  # the board may be in a later image
-                    refusal = error
-                    misses += 1
-                    if misses == _MOST_MISSES:
-                        break
-                    continue
-            found.append((arm, spec.detect(image)))
-    if refusal is not None and not found:
-        raise refusal
-    if not sizes:
-        raise InputError("has no images.", file=source, field="views", hint="give a folder of images or a log")
-    return found, sizes.pop()
+        recording = find_board(source, spec, max_views=max_views, on_share=lambda share: show("board", share))
+    if source.skipped:
+        print_message("warning", f"{source.source}: {source.skipped} damaged frames are skipped")
+    return recording
 
 
 def _board_problem(
     source: str,
     board: str,
-    robot: str | None,
-    chain: KinematicChain | None,
+    arm: RobotKinematics | None,
     link: int,
     camera: str | None,
     eye_to_hand: bool,
@@ -234,49 +196,38 @@ def _board_problem(
     import numpy as np
 
     from splatbot.calibration.intrinsics import calibrate_intrinsics
-    from splatbot.calibration.link_motion import JointLinkMotion, PoseLinkMotion, check_joints
+    from splatbot.calibration.link_motion import PoseLinkMotion
     from splatbot.calibration.measurements import BoardMeasurement
+    from splatbot.calibration.views import ViewSource
     from splatbot.errors import InputError
 
-    found, size = _detect(source, board, max_views, quiet)
-    seen = [(view, corners) for view, corners in found if corners.usable]
+    recording = _find_board(ViewSource(source), board, max_views, quiet)
     if camera is None:
-        intrinsics = calibrate_intrinsics([corners for _, corners in seen], size)
-        _require(intrinsics, source)
+        intrinsics = calibrate_intrinsics(recording.views, recording.size)
+        intrinsics.check()
         lens = intrinsics.camera
     else:
-        lens = _camera(camera, size)
-    motion: LinkMotion
-    if chain is not None:
-        usable = [(arm, c) for arm, c in seen if arm.joints is not None]
-        joints = _rows([arm.joints for arm, _ in usable if arm.joints is not None], source)
-        if usable:
-            check_joints(chain, joints, robot=robot or "", file=source)
-        motion = JointLinkMotion(chain, joints[:, : len(chain)], link)
-    else:
-        usable = [(arm, c) for arm, c in seen if arm.T_base_link is not None]
-        motion = PoseLinkMotion(np.array([arm.T_base_link for arm, _ in usable]))
-    if not usable:
-        hint = "give --robot NAME and joints with the images" if chain is None else "write joint_values: [q1, ...]"
+        lens = _camera(camera, recording.size)
+    seen = [(at, view) for at, view in zip(recording.arms, recording.views, strict=True) if view.usable]
+    known = [(at.T_base_link if arm is None else at.joints, view) for at, view in seen]
+    values, views = [value for value, _ in known if value is not None], [v for value, v in known if value is not None]
+    if not values:
+        hint = "give --robot NAME and joints with the images" if arm is None else "write joint_values: [q1, ...]"
         raise InputError("does not say where the arm was.", file=source, field="joints", hint=hint)
-    return motion, BoardMeasurement(tuple(c for _, c in usable), lens, not eye_to_hand)
+    if len({value.shape for value in values}) > 1:
+        raise InputError("differ in number.", file=source, field="joints", hint="write all joints for each image")
+    motion = PoseLinkMotion(np.array(values)) if arm is None else _by_joints(arm, np.array(values), link, source)
+    return motion, BoardMeasurement(tuple(views), lens, not eye_to_hand)
 
 
-def _rows(joints: list[Array], source: str) -> Array:
-    """Return joint positions (V, J) of as many joints in each view.
+def _by_joints(arm: RobotKinematics, joints: Array, link: int, source: str, stamps: Array | None = None) -> LinkMotion:
+    """Return the motion of a link by joints that were checked."""
+    from splatbot.calibration.link_motion import JointLinkMotion, check_joints
+    from splatbot.collision import RobotSpheres
 
-    Raises:
-        InputError: they differ in number.
-    """
-    import numpy as np
-
-    from splatbot.errors import InputError
-
-    counts = {len(q) for q in joints}
-    if len(counts) > 1:
-        hint = "write all joints for each image"
-        raise InputError(f"has {min(counts)} to {max(counts)} joints.", file=source, field="joints", hint=hint)
-    return np.array(joints).reshape(len(joints), -1)
+    check_joints(arm, joints, file=source)
+    count = len(arm.chain)
+    return JointLinkMotion(RobotSpheres(arm), joints[:, :count], link % (count + 1), stamps)
 
 
 def _camera(name: str, size: tuple[int, int]) -> Camera:
@@ -297,17 +248,17 @@ def _camera(name: str, size: tuple[int, int]) -> Camera:
 
 def _tracked_problem(
     source: str,
-    robot: str | None,
-    chain: KinematicChain | None,
+    arm: RobotKinematics | None,
     link: int,
     joints: Path | None,
     poses: Path | None,
     same_clock: bool,
 ) -> tuple[LinkMotion, PoseMeasurement, float | None]:
     """Return the motion of the link, the tracked poses, and the time offset that the stamps of the motion lack."""
-    from splatbot.calibration.link_motion import check_joints
-    from splatbot.calibration.streams import align_streams, load_stream
+    from splatbot.calibration.link_motion import PoseLinkMotion
+    from splatbot.calibration.streams import align_streams
     from splatbot.errors import InputError
+    from splatbot.formats.trajectory import load_trajectory
     from splatbot.logs.joints import NAME, JointRecord
     from splatbot.results.folder import RunFolder
 
@@ -318,36 +269,30 @@ def _tracked_problem(
     if (joints is None) == (poses is None):
         hint = "give --robot NAME --joints FILE, or --poses FILE; with images of a board, give --board"
         raise InputError("needs the joints or the poses of the arm.", file=source, field="--joints, --poses", hint=hint)
-    tracked = run.load_trajectory() if run.path.is_dir() else load_stream(run.path)
+    tracked = run.load_trajectory() if run.path.is_dir() else load_trajectory(source, unordered=True)
+    motion: LinkMotion
     if joints is not None:
-        if chain is None:
+        if arm is None:
             raise InputError("needs the arm of the joints.", file=joints, field="--robot", hint="give --robot NAME")
         record = JointRecord(joints)
-        check_joints(chain, record.joints, robot=robot or "", file=str(joints))
-        return align_streams(
-            tracked, record.stamps, joints=record.joints, chain=chain, link=link, same_clock=same_clock
-        )
-    assert poses is not None
-    arm = load_stream(poses)
-    return align_streams(tracked, arm.stamps, T_base_link=arm.T_world_camera, same_clock=same_clock)
+        motion = _by_joints(arm, record.joints, link, str(joints), record.stamps)
+    else:
+        recorded = load_trajectory(str(poses), unordered=True)
+        motion = PoseLinkMotion(recorded.T_world_camera, recorded.stamps)
+    return align_streams(tracked, motion, same_clock=same_clock)
 
 
 def _print(found: HandEyeCalibration, source: str, eye_to_hand: bool, board: bool) -> None:
+    from splatbot.cli.calibrate import describe
     from splatbot.cli.tables import print_table
 
-    moving, static = (
-        ("board on its link", "camera in the base") if eye_to_hand else ("camera on its link", "board in the base")
-    )
-    if not board:
-        static = "map in the base"
-    rows = [*_pose_rows(moving, found.T_link_moving, found.covariance_moving)]
+    moving = "board on its link" if eye_to_hand else "camera on its link"
+    static = "camera in the base" if eye_to_hand else "board in the base" if board else "map in the base"
+    rows = _pose_rows(moving, found.T_link_moving, found.covariance_moving)
     rows += _pose_rows(static, found.T_base_static, found.covariance_static)
-    for name, estimate in found.offsets.items():
-        value = f"{1e3 * estimate.value:+.1f} ± {1e3 * estimate.sigma:.1f} m{estimate.unit}"
-        rows.append((name, f"not known: {estimate.refusal}" if estimate.refusal else value))
+    rows += [(name, describe(estimate)) for name, estimate in found.offsets.items()]
     if found.delay is not None:
-        value = f"{1e3 * found.delay.value:.1f} ± {1e3 * found.delay.sigma:.1f} ms"
-        rows.append(("time offset", f"{value}; {found.delay.refusal}" if found.delay.refusal else value))
+        rows.append(("time offset", describe(found.delay)))
     rows.append(("error", f"{found.error:.2f} {found.unit} median, {found.views} views"))
     names = ("without joint offsets", "with joint offsets")
     held_out = ", ".join(f"{e:.2f} {found.unit} {n}" for e, n in zip(found.held_out, names, strict=False))
@@ -369,21 +314,20 @@ def _pose_rows(name: str, T: Array, covariance: Array) -> list[tuple[str, str]]:
     return [(name, f"{shift} mm"), ("", f"{turn} degrees (rotation vector), ± {largest:.2f} about any axis")]
 
 
-def _write(found: HandEyeCalibration, path: Path, link: int, eye_to_hand: bool, *, tracked: bool, joints: int) -> None:
-    """Write the estimates into a scene.yaml."""
+def _completed(
+    scene: Workspace, found: HandEyeCalibration, link: int, arm: RobotKinematics | None, *, tracked: bool
+) -> Workspace:
+    """Return a scene with the estimates: the camera, the joint offsets and, of tracked poses, the base."""
     import numpy as np
 
     from splatbot.geometry import inverse
-    from splatbot.workspace import Workspace
 
-    scene = Workspace.load(path) if path.exists() else Workspace()
-    if eye_to_hand:
-        scene = replace(scene, T_link_camera=found.T_base_static, camera_link=0)
-    else:
-        scene = replace(scene, T_link_camera=found.T_link_moving, camera_link=link)
-    if tracked:
-        scene = replace(scene, T_world_base=inverse(found.T_base_static))
-    offsets = np.zeros(joints)
+    offsets = np.zeros(0 if arm is None else len(arm.chain))
     offsets[: len(found.joint_offsets)] = found.joint_offsets
-    scene = replace(scene, joint_offsets=offsets if np.any(offsets) else None)
-    scene.save(path)
+    return replace(
+        scene,
+        T_link_camera=found.T_base_static if link == 0 else found.T_link_moving,
+        camera_link=link,
+        joint_offsets=offsets if offsets.any() else None,
+        T_world_base=inverse(found.T_base_static) if tracked else scene.T_world_base,
+    )

@@ -12,7 +12,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from splatbot.geometry import inverse, rotation_angles, se3_log
+from splatbot.geometry import inverse, nearest_rotation, rotation_angles, se3_log
 from splatbot.tracking.nearby_keyframes import pose_distance
 
 Array = NDArray[np.float64]
@@ -200,8 +200,7 @@ def _noise_model(covariance: Array) -> gtsam.noiseModel.Base:
 
 
 def orthonormal(T: Array) -> Array:
-    """Return the nearest pose (4, 4) with an exact rotation, by polar decomposition."""
-    U, _, Vt = np.linalg.svd(T[:3, :3])
+    """Return the nearest pose (4, 4) with an exact rotation."""
     out = np.eye(4)
-    out[:3, :3], out[:3, 3] = U @ Vt, T[:3, 3]
+    out[:3, :3], out[:3, 3] = nearest_rotation(T[:3, :3]), T[:3, 3]
     return out

@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatbot.calibration.board import BoardView
+from splatbot.calibration.board import BoardView, CharucoBoard
 from splatbot.calibration.intrinsics import calibrate_intrinsics
 from splatbot.calibration.measurements import project
+from splatbot.calibration.views import ViewSource, find_board
 from splatbot.camera import Camera
 from splatbot.errors import InputError
 from splatbot.geometry import se3_exp
@@ -55,12 +56,8 @@ def test_too_few_views_are_refused_with_their_number() -> None:
 
 
 def test_the_recorded_board_fits_to_an_eighth_of_a_pixel(data_root: Path) -> None:
-    from splatbot.calibration.board import CharucoBoard
-    from splatbot.calibration.views import read_views
-
-    images = [image for _, _, image in read_views(str(data_root / "panda_charuco_32"), max_views=12)]
-    board = CharucoBoard.parse("charuco:10x14:0.07:0.04").completed(images[0])
-    assert board.legacy
-    found = calibrate_intrinsics([board.detect(image) for image in images], (640, 480))
+    board, source = CharucoBoard.parse("charuco:10x14:0.07:0.04"), ViewSource(str(data_root / "panda_charuco_32"))
+    recording = find_board(source, board, max_views=12, on_share=lambda share: None)
+    found = calibrate_intrinsics(recording.views, recording.size)
     assert found.rms < 0.15
     assert found.camera.fx == pytest.approx(614.7, abs=2.0)

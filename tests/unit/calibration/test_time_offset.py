@@ -11,10 +11,13 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from splatbot.calibration.hand_eye import calibrate_hand_eye
-from splatbot.calibration.streams import align_streams, load_stream
+from splatbot.calibration.link_motion import PoseLinkMotion
+from splatbot.calibration.streams import align_streams
 from splatbot.calibration.time_offset import cross_correlate
 from splatbot.errors import InputError
+from splatbot.formats.trajectory import load_trajectory
 from splatbot.geometry import se3_exp
+from splatbot.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
@@ -83,8 +86,8 @@ def test_least_squares_and_cross_correlation_agree_to_five_milliseconds_on_recor
         archive.extractall(tmp_path)
     (arm_file,) = (p for p in tmp_path.rglob(f"*{arm}.csv") if "merged_" not in p.name)
     (camera_file,) = (p for p in tmp_path.rglob(f"*{camera}.csv") if "merged_" not in p.name)
-    tracked, record = load_stream(camera_file), load_stream(arm_file)
-    moved, measured, start = align_streams(tracked, record.stamps, T_base_link=record.T_world_camera)
+    tracked, record = (load_trajectory(path, unordered=True) for path in (camera_file, arm_file))
+    moved, measured, start = align_streams(tracked, PoseLinkMotion(record.T_world_camera, record.stamps))
     assert start is not None
     found = calibrate_hand_eye(moved, measured, delay=start)
     assert found.delay is not None
@@ -92,12 +95,10 @@ def test_least_squares_and_cross_correlation_agree_to_five_milliseconds_on_recor
 
 
 def test_slow_recordings_are_matched_by_equal_stamps_alone() -> None:
-    from splatbot.trajectory import Trajectory
-
     t = np.arange(20.0)
     tracked = Trajectory(t[2:15], motion(t[2:15]))
-    moved, measured, delay = align_streams(tracked, t, T_base_link=motion(t))
+    moved, measured, delay = align_streams(tracked, PoseLinkMotion(motion(t), t))
     assert delay is None
     assert len(moved) == len(measured.T_static_moving) == 13
     with pytest.raises(InputError, match="do not overlap"):
-        align_streams(Trajectory(t + 0.5, motion(t)), t, T_base_link=motion(t))
+        align_streams(Trajectory(t + 0.5, motion(t)), PoseLinkMotion(motion(t), t))

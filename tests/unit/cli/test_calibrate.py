@@ -12,12 +12,14 @@ import numpy as np
 import pytest
 
 from splatbot.calibration.board import CharucoBoard
-from splatbot.calibration.views import read_views
+from splatbot.calibration.views import ViewSource
 from splatbot.config import Config, load_config, with_sensor
 from splatbot.errors import ConfigError, FormatError
 from splatbot.logs import open_log, record
 from splatbot.logs.calibration import read_calibration
+from splatbot.logs.images import read_color
 from splatbot.workspace import Workspace
+from tests.conftest import MakeLog
 from tests.unit.cli.conftest import RunCommand
 
 MOVING = "synthetic:room?trajectory=turns&frames=45&width=320&height=240"
@@ -74,14 +76,14 @@ def test_images_of_a_board_give_a_camera_file_and_a_scene(run: RunCommand, tmp_p
     images = data_root / "panda_charuco_32"
     answer = run("calibrate", "intrinsics", images, "--board", BOARD, "--out", tmp_path / "camera.json")
     assert answer.code == 0
-    assert "614.7 ±" in answer.out
+    assert re.search(r"fx +614\.7\d ± 0\.\d\d px", answer.out)
     assert read_calibration(tmp_path / "camera.json").camera.width == 640
     scene = tmp_path / "scene.yaml"
     Workspace(gravity=np.array([0.0, 0.0, -1.0])).save(scene)
     words = ("--board", BOARD, "--camera", tmp_path / "camera.json", "--robot", "panda", "--out", scene)
     answer = run("calibrate", "hand-eye", images, *words)
     assert answer.code == 0
-    assert re.search(r"panda_joint5 +\+1[01]\.\d ± 0\.\d mrad", answer.out)
+    assert re.search(r"panda_joint5 +1[01]\.\d\d ± 0\.\d\d mrad", answer.out)
     assert "not known: it turns the base" in answer.out
     written = Workspace.load(scene)
     assert written.gravity is not None  # kept
@@ -105,7 +107,7 @@ def test_two_pose_files_of_one_motion_give_the_hand_eye_pose_and_the_time_offset
     (arm,), (camera,) = (list(tmp_path.rglob(f"*{name}.csv")) for name in ("sr300_hinge", "target_ir"))
     answer = run("calibrate", "hand-eye", camera, "--poses", arm, "--link", "-1", "--out", tmp_path / "scene.yaml")
     assert answer.code == 0
-    assert re.search(r"time offset +-1[67]\.\d ± \d\.\d ms", answer.out)
+    assert re.search(r"time offset +-1[67]\.\d\d ± \d\.\d\d ms", answer.out)
     written = Workspace.load(tmp_path / "scene.yaml")
     assert written.T_world_base is not None
     assert written.joint_offsets is None
@@ -122,6 +124,8 @@ def test_two_pose_files_of_one_motion_give_the_hand_eye_pose_and_the_time_offset
         (("{images}", "--board", BOARD, "--offsets", "yes"), "--offsets"),
         (("{images}", "--board", BOARD, "--poses", "x.txt"), "--joints, --poses"),
         (("{images}", "--board", BOARD, "--max-views", "0"), "--max-views"),
+        (("{images}", "--board", BOARD, "--link", "0"), "--link"),
+        (("{images}", "--board", BOARD, "--same-clock"), "--same-clock"),
         (("{images}", "--board", BOARD), "--link"),
         (("{images}", "--board", BOARD, "--robot", "ur5e"), "disagree"),
         (("{images}", "--board", BOARD, "--max-views", "4"), "views"),
@@ -160,7 +164,7 @@ def test_a_damaged_file_next_to_an_image_is_named(tmp_path: Path, text: str) -> 
     cv2.imwrite(str(tmp_path / "a.png"), np.zeros((8, 8, 3), np.uint8))
     (tmp_path / "a.yaml").write_text(text)
     with pytest.raises(FormatError, match=r"a\.yaml"):
-        list(read_views(str(tmp_path), max_views=3))
+        list(ViewSource(str(tmp_path)).read(3))
 
 
 def test_images_of_a_board_parallel_to_the_image_give_no_camera_file(run: RunCommand, tmp_path: Path) -> None:
@@ -176,3 +180,25 @@ def test_images_of_a_board_parallel_to_the_image_give_no_camera_file(run: RunCom
     assert answer.code == 2
     assert "is not determined" in answer.err
     assert not (tmp_path / "camera.json").exists()
+
+
+def test_images_of_a_log_are_those_of_its_files_so_that_distortion_is_estimated(make_log: MakeLog) -> None:
+    folder = make_log(6)
+    values = json.loads((folder / "intrinsics.json").read_text())
+    (folder / "intrinsics.json").write_text(json.dumps({**values, "distortion": [-0.2, 0.05, 0, 0, 0]}))
+    source = ViewSource(str(folder))
+    assert source.calibration is not None
+    assert source.calibration.depth_scale == 5000  # of this log, not the default of image folders
+    first = sorted((folder / "rgb").iterdir())[0]
+    (_, _, image), *_ = source.read(1)
+    assert (image == read_color(first)).all()
+    assert not (open_log(folder)[0].rgb == image).all()
+
+
+def test_damaged_frames_of_a_log_are_counted_and_the_others_read(make_log: MakeLog) -> None:
+    folder = make_log(6)
+    path = sorted((folder / "rgb").iterdir())[2]
+    path.write_bytes(path.read_bytes()[:-20])
+    source = ViewSource(str(folder))
+    assert len(list(source.read(100))) == 5
+    assert source.skipped == 1
