@@ -25,7 +25,7 @@ _MAX_VIEWS = 100
 def calibrate_intrinsics_command(
     views: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="IMAGES|LOG")],
     /,
-    board: str,
+    board: Annotated[str, tyro.conf.arg(metavar="SPEC")],
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
     depth_scale: float | None = None,
     max_views: int = _MAX_VIEWS,
@@ -69,20 +69,22 @@ def calibrate_intrinsics_command(
     found.check()
     if out is not None:
         recorded = source.calibration or Calibration(found.camera, MILLIMETRES)
-        save_calibration(replace(recorded, camera=found.camera, depth_scale=depth_scale or recorded.depth_scale), out)
+        scale = recorded.depth_scale if depth_scale is None else depth_scale
+        save_calibration(replace(recorded, camera=found.camera, depth_scale=scale), out)
+        _announce(out, quiet)
     return 0
 
 
 def calibrate_hand_eye_command(
     source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="IMAGES|LOG|RUN|POSES")],
     /,
-    board: str | None = None,
-    robot: str | None = None,
+    board: Annotated[str | None, tyro.conf.arg(metavar="SPEC")] = None,
+    robot: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None,
     joints: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
     poses: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
     camera: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE")] = None,
     eye_to_hand: bool = False,
-    link: int | None = None,
+    link: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
     offsets: Literal["auto", "yes", "no"] = "auto",
     same_clock: bool = False,
     max_views: int = _MAX_VIEWS,
@@ -162,7 +164,13 @@ def calibrate_hand_eye_command(
     found.check(moving=not eye_to_hand, static=eye_to_hand or board is None)
     if out is not None:
         _completed(scene, found, 0 if eye_to_hand else carrier, arm, tracked=board is None).save(out)
+        _announce(out, quiet)
     return 0
+
+
+def _announce(out: Path, quiet: bool) -> None:
+    if not quiet:
+        print(f"written: {out}")
 
 
 def _find_board(source: ViewSource, board: str, max_views: int, quiet: bool) -> BoardRecording:
