@@ -34,6 +34,9 @@ COMMANDS = {
     "audit": _Command("splatbot.cli.audit", "audit", "Check a map against measured depth: missed surface, false hits."),
     "render": _Command("splatbot.cli.render", "render", "Render a view of a map to a PNG."),
     "info": _Command("splatbot.cli.info", "info", "Describe a map, a log or a run."),
+    "download": _Command(
+        "splatbot.cli.download", "download", "Fetch a public RGB-D recording from its official address."
+    ),
     "simulate": _Command("splatbot.cli.simulate", "simulate", "Record a synthetic log with exact depth and poses."),
     "record": _Command("splatbot.cli.record", "record", "Write a log as one MCAP file of ROS 2 messages."),
     "serve": _Command("splatbot.cli.serve", "serve", "Serve a map over HTTP."),
