@@ -2,42 +2,70 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+from numpy.typing import ArrayLike
+
 from splatbot.errors import FormatError, InputError
 from splatbot.logs import Log, open_log
 from splatbot.mapping.selfmask import SelfMask
+from splatbot.protocols import RobotKinematics
 from splatbot.results.folder import RunFolder
 from splatbot.robots.store import load_robot
 from splatbot.run.masked import MaskedLog
-from splatbot.workspace import NAME, find_workspace
+from splatbot.workspace import NAME, Workspace, find_workspace
 
 
-def without_robot(log: Log, robot: str | None) -> Log:
-    """Mask the robot in the frames of a log; without a robot the log is returned unchanged.
+def self_mask(
+    robot: RobotKinematics, workspace: Workspace | None, *, held: ArrayLike | None = None, file: str | Path = NAME
+) -> SelfMask:
+    """Return the mask of a robot for the camera that a workspace describes.
 
     Args:
-        log: log whose folder contains ``joints.txt`` and ``scene.yaml`` with the camera's pose on its link.
-        robot: name as listed by ``splatbot robot list``, or None.
+        robot: the robot.
+        workspace: camera on its link, and the joints' names and offsets.
+        held: (A, 4) spheres (x, y, z, radius) [m] of an object in the hand, in the frame of the last link.
+        file: origin of the workspace, for messages.
 
     Raises:
-        InputError: the robot or the pose of its camera is unknown.
+        InputError: the pose of the camera is unknown, or the workspace does not fit the robot.
     """
-    if robot is None:
-        return log
-    workspace = find_workspace(log.uri)
     if workspace is None or workspace.T_link_camera is None:
         raise InputError(
             "has no T_link_camera.",
-            file=f"{log.uri}/{NAME}",
+            file=file,
             field="T_link_camera",
             hint="write translation and quaternion_wxyz of the camera on its link, and camera_link (-1: the last)",
         )
-    mask = SelfMask(
-        load_robot(robot),
+    return SelfMask(
+        robot,
         workspace.T_link_camera,
         link=workspace.camera_link,
         joint_offsets=workspace.joint_offsets,
+        joint_names=workspace.joint_names,
+        held=held,
     )
-    return MaskedLog(log, mask)
+
+
+def open_without_robot(uri: str, robot: str | None, *, camera: str | None = None) -> Log:
+    """Open a log whose frames have the robot masked; without a robot it is opened unchanged.
+
+    Args:
+        uri: log whose folder has the joints (``joints.txt`` or a recording of ROS topics) and ``scene.yaml`` with the
+            camera's pose on its link.
+        robot: name as listed by ``splatbot robot list``, or None.
+        camera: intrinsics that replace those of the log.
+
+    Raises:
+        InputError: the robot or the pose of its camera is unknown.
+        LogError: the log is missing or damaged.
+    """
+    if robot is None:
+        return open_log(uri, camera=camera)
+    workspace = find_workspace(uri.partition("?")[0])
+    mask = self_mask(load_robot(robot), workspace, file=f"{uri}/{NAME}")
+    assert workspace is not None
+    return MaskedLog(open_log(uri, camera=camera, joint_delay=workspace.joint_delay), mask)
 
 
 def reopen_log(run: RunFolder, *, uri: str | None = None, camera: str | None = None) -> Log:
@@ -56,4 +84,4 @@ def reopen_log(run: RunFolder, *, uri: str | None = None, camera: str | None = N
     found = uri or source.get("uri")
     if found is None:
         raise FormatError("does not name the log.", file=run.metrics, field="log.uri", hint="give --log LOG")
-    return without_robot(open_log(str(found), camera=camera or source.get("camera")), source.get("robot"))
+    return open_without_robot(str(found), source.get("robot"), camera=camera or source.get("camera"))

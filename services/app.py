@@ -35,6 +35,7 @@ from splatbot.services.routes import (
     picks,
     plans,
     render,
+    robots,
     ros,
     trajectories,
     trials,
@@ -54,7 +55,9 @@ def create_app(runtime: Runtime) -> FastAPI:
     """Create the service on ``runtime``, which starts and stops with the application."""
     settings = runtime.settings
     access = Access(settings)
-    integrations = Integrations(settings, access, runtime.store, runtime.arms, on_frame=runtime.take)
+    integrations = Integrations(
+        settings, access, runtime.store, runtime.arms, on_frame=runtime.take, on_joints=runtime.report_joints
+    )
 
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
@@ -104,6 +107,7 @@ def create_app(runtime: Runtime) -> FastAPI:
         plans,
         grasps,
         objects,
+        robots,
         picks,
         arms,
         trajectories,

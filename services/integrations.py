@@ -13,6 +13,7 @@ from splatbot.services.ros.recorder import McapRecorder
 from splatbot.services.ros.zenoh_bridge import ZenohBridge
 from splatbot.services.settings import ServiceSettings
 from splatbot.services.store import MapStore
+from splatbot.services.topics import JointState
 from splatbot.services.viewer.viewer import Viewer
 
 
@@ -25,6 +26,7 @@ class Integrations:
         store: the maps.
         arms: executes the motions that ROS clients send.
         on_frame: called with each frame that ROS clients publish.
+        on_joints: called with the robot's name and its joints that ROS clients publish.
 
     Raises:
         InputError: the viewer's port is taken.
@@ -39,8 +41,16 @@ class Integrations:
         arms: Arms,
         *,
         on_frame: Callable[[Frame], Any],
+        on_joints: Callable[[str, JointState], Any],
     ) -> None:
-        self.ros = RosNode(store, arms=arms, on_frame=on_frame, max_pixels=settings.max_pixels)
+        self.ros = RosNode(
+            store,
+            arms=arms,
+            robot=settings.robot or "panda",
+            on_frame=on_frame,
+            on_joints=on_joints,
+            max_pixels=settings.max_pixels,
+        )
         router = settings.zenoh_router
         self._zenoh = ZenohBridge(self.ros.graph, router, domain=settings.ros_domain) if router is not None else None
         self._record = settings.record

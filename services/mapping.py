@@ -9,11 +9,12 @@ from typing import Any
 
 from splatbot.config import Config
 from splatbot.errors import InputError, LogError, MapNotFoundError
-from splatbot.logs import Log
+from splatbot.logs import Log, open_log
 from splatbot.services.jobs import JobCancelled, JobHandle, Work
 from splatbot.services.live import LiveMapping
 from splatbot.services.problems import disk_error
-from splatbot.services.recordings import open_allowed, unpack
+from splatbot.services.recordings import allowed_log, unpack
+from splatbot.services.robot_mask import MaskedSource
 from splatbot.services.runtime import Runtime
 from splatbot.services.settings import ServiceSettings
 from splatbot.services.store import ServedMap
@@ -78,7 +79,9 @@ def _unpacked(settings: ServiceSettings, archive: Path, handle: JobHandle) -> Lo
         progress=progress,
     )
     archive.unlink()
-    return open_allowed(str(home), [str(folder)], max_frames=settings.max_frames, max_pixels=settings.max_pixels)
+    return open_log(
+        allowed_log(str(home), [str(folder)], max_frames=settings.max_frames, max_pixels=settings.max_pixels)
+    )
 
 
 def _reason(error: Exception) -> str:
@@ -99,7 +102,8 @@ def _map(
 ) -> dict[str, Any]:
     from splatbot.slam import Slam
 
-    frames = (log.read(i) for i in range(total))
+    recorded = (log.read(i) for i in range(total))
+    frames = recorded if served.mask is None else MaskedSource(recorded, served.mask)
     tracked = 0
 
     def on_result(result: FrameResult) -> None:

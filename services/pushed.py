@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import queue
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from dataclasses import replace
 
@@ -30,10 +30,12 @@ class PushedFrames:
 
     Args:
         capacity: frames that may wait.
+        mask: masks the robot in each frame; a frame that it refuses is not mapped.
     """
 
-    def __init__(self, capacity: int = 4) -> None:
-        self._frames: queue.Queue[Frame | None] = queue.Queue()
+    def __init__(self, capacity: int = 4, mask: Callable[[Frame], Frame] | None = None) -> None:
+        self._frames: queue.Queue[tuple[Frame, int, float] | None] = queue.Queue()
+        self._mask = mask
         self._capacity = capacity
         self._lock = threading.Lock()
         self._answers: dict[int, Future[FrameResult]] = {}
@@ -64,7 +66,7 @@ class PushedFrames:
             stamp = self._in_time_of_map(frame.stamp)
             answer: Future[FrameResult] = Future()
             self._answers[index] = answer
-            self._frames.put(replace(frame, index=index, stamp=stamp))
+            self._frames.put((frame, index, stamp))
         return answer
 
     def resync(self) -> None:
@@ -108,8 +110,14 @@ class PushedFrames:
                 future.set_exception(StreamEndedError(f"the frame was not mapped: {why}."))
 
     def __iter__(self) -> Iterator[Frame]:
-        while (frame := self._frames.get()) is not None:
-            yield frame
+        while (pushed := self._frames.get()) is not None:
+            frame, index, stamp = pushed
+            try:
+                masked = frame if self._mask is None else self._mask(frame)  # by the stamps of the camera's clock
+            except SplatbotError as error:
+                self.refuse(index, error)
+                continue
+            yield replace(masked, index=index, stamp=stamp)
 
     def _check_open(self) -> None:
         if self._ended is not None:

@@ -10,7 +10,6 @@ from pathlib import Path, PurePosixPath
 from typing import IO, BinaryIO
 
 from splatbot.errors import InputError, LogError
-from splatbot.logs import Log, open_log
 from splatbot.logs.calibration import read_calibration
 from splatbot.logs.image_size import image_size
 from splatbot.logs.index import read_index
@@ -30,12 +29,12 @@ _LINE_BYTES = 256
 _MAX_DOCUMENT = 1 << 20  # bytes of a JSON or YAML file
 
 
-def open_allowed(uri: str, roots: Sequence[str], *, camera: str | None = None, max_frames: int, max_pixels: int) -> Log:
-    """Open the log that a client names: synthetic, or a folder under one of ``roots`` after resolving links.
+def allowed_log(uri: str, roots: Sequence[str], *, camera: str | None = None, max_frames: int, max_pixels: int) -> str:
+    """Return the address of the log that a client names: synthetic, or a folder under one of ``roots``, links resolved.
 
     Raises:
         InputError: it is elsewhere, whether or not there is something.
-        LogError: it cannot be opened.
+        LogError: its lists are damaged, or lead out of it.
         TooLargeError: a synthetic log has more than ``max_frames`` frames, or more than ``max_pixels`` a frame.
     """
     if camera is not None and camera not in PRESETS:
@@ -50,13 +49,13 @@ def open_allowed(uri: str, roots: Sequence[str], *, camera: str | None = None, m
             raise TooLargeError(
                 f"has {options.frames} frames, at most {max_frames} are mapped.", field="log", hint=hint
             )
-        return open_log(uri, camera=camera)
+        return uri
     if "\x00" not in uri and len(uri) <= _MAX_URI:
         for root in (Path(root).resolve() for root in roots):
             folder = (root / uri).resolve()  # an absolute uri is used as it is
             if folder.is_relative_to(root) and folder.is_dir():
                 stays_inside(folder)
-                return open_log(folder, camera=camera)
+                return str(folder)
     hint = "name a recording under one of the service's log roots (SPLATBOT_LOG_ROOTS), or synthetic:SCENE"
     raise InputError("is no recording that may be mapped.", field="log", hint=hint)
 

@@ -15,16 +15,18 @@ from splatbot.config import Config
 from splatbot.errors import ConfigError, MapNotFoundError, SplatbotError
 from splatbot.frame import Frame
 from splatbot.rasterize.native import native
-from splatbot.services.arms import Arms
+from splatbot.services.arms import Arms, known_robot
 from splatbot.services.jobs import Job, Jobs, Work
 from splatbot.services.library import MapLibrary
 from splatbot.services.live import LiveMapper, LiveMapping
 from splatbot.services.metrics import Metrics
 from splatbot.services.plans import Plans
 from splatbot.services.pushed import PushedFrames, StreamEndedError
+from splatbot.services.robot_mask import MaskedSource, RobotMask
 from splatbot.services.scratch import sweep_scratch
 from splatbot.services.settings import ServiceSettings
 from splatbot.services.store import MapExistsError, MapStore, ServedMap
+from splatbot.services.topics import JOINTS, JointState, robot_topic
 from splatbot.workspace import Workspace
 
 _log = logging.getLogger(__name__)
@@ -38,6 +40,10 @@ class Runtime:
         store: the maps; None makes one.
         config: of the mapping that clients ask for.
 
+    Raises:
+        InputError: the robot of the settings is unknown.
+        FormatError: the scene of the settings is damaged.
+
     Attributes:
         store: maps and their bus.
         jobs: work that outlasts a request.
@@ -46,6 +52,7 @@ class Runtime:
         metrics: for Prometheus.
         library: maps on disk. If None, maps live in memory only.
         draining: the service is about to end.
+        robot, workspace: the settings' robot and its scene, for frames of ROS topics.
     """
 
     def __init__(
@@ -55,6 +62,8 @@ class Runtime:
         self.store = store or MapStore(most=settings.max_maps)
         self.bus = self.store.bus
         self.config = config or Config()
+        self.robot = None if settings.robot is None else known_robot(settings.robot)
+        self.workspace = None if settings.scene is None else Workspace.load(settings.scene)
         self.library = MapLibrary(settings.data_dir) if settings.data_dir is not None else None
         if self.library is not None:
             self.library.lock()
@@ -91,8 +100,9 @@ class Runtime:
             self._begin(mapping)
 
     def follow(self, served: ServedMap, source: Iterable[Frame], mapper: LiveMapper) -> None:
-        """Map frames in a thread of their own, once the service has begun."""
-        mapping = LiveMapping(self.store, served, source, mapper)
+        """Map frames in a thread of their own, once the service has begun; the robot in them is masked by the map."""
+        frames = source if served.mask is None else MaskedSource(source, served.mask)
+        mapping = LiveMapping(self.store, served, frames, mapper)
         with self._lock:
             self._mappings[served.generation] = mapping
             if not self._started:
@@ -101,17 +111,19 @@ class Runtime:
         self._begin(mapping)
 
     def open_stream(
-        self, map_id: str, *, config: Config | None = None, workspace: Workspace | None = None
+        self, map_id: str, *, workspace: Workspace | None = None, mask: RobotMask | None = None
     ) -> ServedMap:
-        """Create a map that receives its frames through :meth:`stream`.
+        """Create a map that receives its frames through :meth:`stream`; ``mask`` masks the robot in them.
 
         Raises:
             MapExistsError: the name is taken.
         """
         from splatbot.slam import Slam
 
-        served = self.store.add(map_id, source="pushed frames", state="mapping", workspace=workspace, awaited=False)
-        frames = PushedFrames(self.settings.max_waiting_frames)
+        served = self.store.add(
+            map_id, source="pushed frames", state="mapping", workspace=workspace, mask=mask, awaited=False
+        )
+        frames = PushedFrames(self.settings.max_waiting_frames, mask)
         mapping = LiveMapping(
             self.store,
             served,
@@ -149,8 +161,31 @@ class Runtime:
             InputError: the frame does not fit those before, or the map is made of something else.
         """
         with suppress(MapExistsError):
-            self.open_stream(map_id)
+            self.open_stream(map_id, workspace=self.workspace, mask=self.new_mask(self.workspace))
         self.stream(map_id).push(frame)
+
+    def new_mask(self, workspace: Workspace | None) -> RobotMask | None:
+        """Return a mask of the settings' robot for the camera of a workspace; None without such a robot.
+
+        Raises:
+            InputError: the pose of the camera is unknown, or the workspace does not fit the robot.
+        """
+        return None if self.robot is None else RobotMask(self.robot, workspace)
+
+    def report_joints(self, robot: str, state: JointState) -> int:
+        """Publish a robot's joints, and keep them for the frames of each map in which it is masked.
+
+        Returns:
+            The number of maps that keep them.
+
+        Raises:
+            InputError: the state lacks a joint of such a map's robot, or a value is not finite.
+        """
+        masks = [served.mask for served in self.store.list() if served.mask is not None]
+        masks = [mask for mask in masks if mask.robot.name == robot]
+        kept = sum(mask.history.add(state) for mask in masks)
+        self.bus.publish(robot_topic(robot, JOINTS), state)
+        return kept
 
     def make(self, served: ServedMap, work: Work, **more: Any) -> Job:
         """Queue the job that makes a map; deleting the map cancels it.

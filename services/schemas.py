@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -12,6 +13,7 @@ from splatbot.errors import InputError
 from splatbot.geometry import pose_from_quat
 from splatbot.planning.timing import DEFAULT_SPEED
 from splatbot.services.arrays import Configurations, Points
+from splatbot.workspace import MAX_JOINT_DELAY_S, Workspace
 
 Vector3 = tuple[float, float, float]
 Vector4 = tuple[float, float, float, float]
@@ -19,6 +21,8 @@ Mode = Literal["rgb", "depth", "normal", "alpha"]
 
 
 MOST_MARGIN_M = 10.0  # larger than any arm
+MAX_JOINTS = 64
+MAX_STATES = 1000
 
 
 class Request(BaseModel):
@@ -84,12 +88,67 @@ class MapInfo(BaseModel):
     sh_degree: int = Field(description="degree of the spherical harmonics of colours, 0..4")
     stamp: float = Field(description="time of the last frame in the map [s]")
     bounds: Bounds | None = Field(None, description="null while the map is empty")
+    robot: RobotMaskInfo | None = Field(None, description="robot that is masked in the frames; null: none")
 
 
 class MapList(BaseModel):
     """All maps."""
 
     maps: list[MapInfo] = Field(description="all maps")
+
+
+class RobotInView(Request):
+    """The robot in the camera's view. Its pixels are masked, and a frame without its joints is not mapped."""
+
+    name: str = Field(description="robot, as `splatbot robot list` names it")
+    T_link_camera: Pose | None = Field(
+        None, description="pose of the camera on its link; null: all values are those of the recording's scene.yaml"
+    )
+    camera_link: int = Field(-1, description="index of the link that carries the camera; -1: the last, 0: the base")
+    joint_offsets: list[float] | None = Field(
+        None, max_length=MAX_JOINTS, description="added to measured joint positions [rad or m]"
+    )
+    joint_delay: float = Field(
+        0.0,
+        ge=-MAX_JOINT_DELAY_S,
+        le=MAX_JOINT_DELAY_S,
+        description="time by which the stamps of joint states are later than the motion [s]",
+    )
+    joint_names: list[str] = Field(
+        [], max_length=MAX_JOINTS, description="names of the joints in joint states; default: those of the model"
+    )
+
+    def workspace(self, known: Workspace | None) -> Workspace | None:
+        """Return the workspace with this camera, or the known one unchanged if no pose of the camera is given.
+
+        Raises:
+            InputError: a value is invalid.
+        """
+        if self.T_link_camera is None:
+            return known
+        return replace(
+            known or Workspace(),
+            T_link_camera=self.T_link_camera.matrix("T_link_camera"),
+            camera_link=self.camera_link,
+            joint_offsets=None if self.joint_offsets is None else np.array(self.joint_offsets),
+            joint_delay=self.joint_delay,
+            joint_names=tuple(self.joint_names),
+        )
+
+
+class JointStatesTaken(BaseModel):
+    """Use of reported joint states."""
+
+    maps: int = Field(description="maps in which the robot is masked by them")
+
+
+class RobotMaskInfo(BaseModel):
+    """How the robot was masked in the frames so far."""
+
+    name: str = Field(description="robot")
+    masked: int = Field(description="frames whose pixels of the robot are masked")
+    refused: int = Field(description="frames that are not mapped, because joint states were missing or stale")
+    problem: str | None = Field(None, description="why the latest frame was refused; null if it was masked")
 
 
 class MapRequest(Request):
@@ -100,6 +159,7 @@ class MapRequest(Request):
     camera: str | None = Field(None, description="preset of intrinsics (tum_fr1, ...) instead of the log's own")
     max_frames: Annotated[int, Field(ge=1)] | None = Field(None, description="read no more than these")
     robot_base: Pose | None = Field(None, description="T_world_base, for questions about the arm")
+    robot: RobotInView | None = Field(None, description="robot in view, which is masked; null: no robot is masked")
 
 
 class DistanceRequest(Request):

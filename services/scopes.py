@@ -22,6 +22,8 @@ NEEDS: dict[tuple[str, str], Scope] = {
     ("POST", "/v1/maps/{map_id}/views"): "read",
     ("POST", "/v1/maps/{map_id}/plans"): "read",
     ("POST", "/v1/maps/{map_id}/grasps"): "read",
+    ("PUT", "/v1/maps/{map_id}/held"): "map",
+    ("POST", "/v1/robots/{robot}/joints"): "map",
     ("POST", "/v1/ik"): "read",
     ("POST", "/v1/picks"): "map",
     ("POST", "/v1/sim/trials"): "map",

@@ -51,6 +51,8 @@ class ServiceSettings(BaseSettings):
     data_dir: Path | None = Field(None, description="folder of saved maps; without it maps live in memory")
     log_roots: Words = Field((), description="folders whose recordings may be mapped by POST /v1/maps")
     save_every_s: float = Field(30.0, gt=0, description="how often growing maps are saved to data_dir [s]")
+    robot: str | None = Field(None, description="robot that is masked in frames of ROS topics, cameras and --log")
+    scene: Path | None = Field(None, description="scene.yaml with T_link_camera: the camera on that robot's link")
     max_maps: int = Field(256, ge=1, description="maps that are served at once")
     max_points: int = Field(100_000, ge=1, description="points in one distance request")
     max_configurations: int = Field(10_000, ge=1, description="joint configurations in one request")

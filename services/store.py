@@ -16,6 +16,7 @@ from splatbot.services.bus import Bus
 from splatbot.services.derived import Derived
 from splatbot.services.frames_first import FramesFirst
 from splatbot.services.problems import MapNotReadyError
+from splatbot.services.robot_mask import RobotMask
 from splatbot.services.topics import REMOVED, STATE, TRAJECTORY, map_topic
 from splatbot.trajectory import Trajectory
 from splatbot.workspace import Workspace
@@ -51,6 +52,7 @@ class ServedMap:
         workspace: pose of the robot's base in it, if known.
         awaited: the service counts as ready only once this map has a state.
         run: folder of the run that made it; None if there is no such run.
+        mask: of the robot in its frames, while it is mapped; None if no robot is masked.
         generation: number of the map in this process; a later map of the same name has another.
         derived: results computed from the snapshot.
     """
@@ -64,6 +66,7 @@ class ServedMap:
     workspace: Workspace | None = None
     awaited: bool = True
     run: RunFolder | None = None
+    mask: RobotMask | None = dataclasses.field(default=None, repr=False, compare=False)
     generation: int = 0
     derived: Derived = dataclasses.field(default_factory=Derived, repr=False, compare=False)
 
@@ -121,6 +124,7 @@ class MapStore:
         workspace: Workspace | None = None,
         awaited: bool = True,
         run: RunFolder | None = None,
+        mask: RobotMask | None = None,
         counted: bool = True,
     ) -> ServedMap:
         """Serve a map under a new name. Saved maps that return at a start are not ``counted``: all of them return.
@@ -136,7 +140,7 @@ class MapStore:
                 hint = "delete a map, or raise SPLATBOT_MAX_MAPS"
                 raise TooManyMapsError(f"{len(self._maps)} maps are served already.", field="id", hint=hint)
             number = next(self._generations)
-            served = ServedMap(map_id, source, state, None, snapshot, trajectory, workspace, awaited, run, number)
+            served = ServedMap(map_id, source, state, None, snapshot, trajectory, workspace, awaited, run, mask, number)
             self._put(served)
         return served
 

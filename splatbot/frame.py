@@ -66,6 +66,7 @@ class Frame:
         source: origin of the frame, for messages.
         depth_delay: time [s] by which the depth image is later than ``stamp``, by the stamps of a sensor whose streams
             are not synchronized.
+        joint_names: names of ``joints``. If empty, they are in the order of the robot.
 
     Raises:
         InputError: sizes differ, a type is wrong or depth is negative.
@@ -81,6 +82,7 @@ class Frame:
     prior: PosePrior | None = None
     source: str = field(default="", compare=False)
     depth_delay: float = 0.0
+    joint_names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         where = self.source or f"frame {self.index}"
@@ -117,6 +119,9 @@ class Frame:
                 field="mask",
                 hint=f"give {size} bool, True where a pixel may be used",
             )
+        if self.joint_names and (self.joints is None or len(self.joint_names) != len(self.joints)):
+            hint = "name every joint, or none"
+            raise InputError(f"has {len(self.joint_names)} names.", file=where, field="joint_names", hint=hint)
         if not np.isfinite(self.depth).all():
             object.__setattr__(self, "depth", np.nan_to_num(self.depth, nan=0.0, posinf=0.0, neginf=0.0))
         if (self.depth < 0).any():

@@ -18,6 +18,7 @@ from splatbot.geometry import pose_from_quat, rotation_to_quat, transform_points
 Array = NDArray[np.float64]
 
 NAME = "scene.yaml"
+MAX_JOINT_DELAY_S = 1.0
 _KEYS = (
     "T_world_base",
     "gravity",
@@ -27,6 +28,8 @@ _KEYS = (
     "camera_link",
     "objects",
     "joint_offsets",
+    "joint_delay",
+    "joint_names",
 )
 
 
@@ -82,6 +85,8 @@ class Workspace:
         camera_link: index of the link that carries the camera; -1 is the last one, 0 the base.
         objects: named objects.
         joint_offsets: (J,) offsets to be added to measured joint positions [rad or m].
+        joint_delay: time [s] by which the stamps of measured joint positions are later than the motion.
+        joint_names: (J,) names of the robot's joints in recordings, if they are not those of its model.
 
     Raises:
         InputError: a value has a wrong shape, is not finite, or is no rigid pose, no unit vector or an empty box.
@@ -95,6 +100,8 @@ class Workspace:
     camera_link: int = -1
     objects: tuple[NamedPlace, ...] = ()
     joint_offsets: Array | None = None
+    joint_delay: float = 0.0
+    joint_names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         _check("T_world_base", self.T_world_base, (4, 4), "a pose")
@@ -112,6 +119,9 @@ class Workspace:
         for name, T in (("T_world_base", self.T_world_base), ("T_link_camera", self.T_link_camera)):
             if T is not None and np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > 1e-6:
                 raise InputError("is no rigid pose.", field=name, hint="give a rotation and a translation")
+        if not abs(self.joint_delay) <= MAX_JOINT_DELAY_S:
+            hint = f"give seconds, at most {MAX_JOINT_DELAY_S:g}"
+            raise InputError(f"is {self.joint_delay}.", field="joint_delay", hint=hint)
         if not isinstance(self.camera_link, int) or isinstance(self.camera_link, bool):
             raise InputError(
                 f"is {self.camera_link!r}.", field="camera_link", hint="give a link's number, -1: the last"
@@ -141,6 +151,8 @@ class Workspace:
                 camera_link=found.get("camera_link", -1),
                 objects=_places(found.get("objects")),
                 joint_offsets=_array(found.get("joint_offsets"), "joint_offsets"),
+                joint_delay=_number(found.get("joint_delay", 0.0), "joint_delay"),
+                joint_names=_names(found.get("joint_names", [])),
             )
         except InputError as error:
             raise FormatError(error.message, file=path, field=error.field, hint=error.hint) from error
@@ -159,6 +171,10 @@ class Workspace:
                 document[key] = _plain(value, 9)
         if self.joint_offsets is not None:
             document["joint_offsets"] = _plain(self.joint_offsets)
+        if self.joint_delay:
+            document["joint_delay"] = round(self.joint_delay, 6)
+        if self.joint_names:
+            document["joint_names"] = list(self.joint_names)
         if self.objects:
             document["objects"] = [
                 {"name": o.name, "at": _plain(o.at)} | ({"aliases": list(o.aliases)} if o.aliases else {})
@@ -289,6 +305,18 @@ def _places(value: Any) -> tuple[NamedPlace, ...]:
             raise InputError(f"{entry['name']} has no valid position.", field="objects", hint=hint)
         found.append(NamedPlace(entry["name"], at, tuple(words[1:])))
     return tuple(found)
+
+
+def _number(value: Any, name: str) -> float:
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        raise InputError(f"is {value!r}.", field=name, hint="give a number")
+    return float(value)
+
+
+def _names(value: Any) -> tuple[str, ...]:
+    if not isinstance(value, list) or not all(isinstance(name, str) for name in value):
+        raise InputError("is no list of names.", field="joint_names", hint="list the names in the robot's order")
+    return tuple(value)
 
 
 def _array(value: Any, name: str) -> Array | None:

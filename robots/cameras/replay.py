@@ -79,8 +79,10 @@ class ReplayCamera:
         self._rng = np.random.default_rng(self.options.fault_seed)
 
     @classmethod
-    def from_uri(cls, uri: str) -> ReplayCamera:
+    def from_uri(cls, uri: str, *, joint_delay: float = 0.0) -> ReplayCamera:
         """Open the camera of `replay:LOG?speed=2&loop=1&...`; other options are passed to the log.
+
+        ``joint_delay`` is that of :func:`splatbot.logs.open_log`.
 
         Raises:
             InputError: an option is no number or out of range.
@@ -96,7 +98,8 @@ class ReplayCamera:
             except ValueError as error:
                 raise InputError(f"is {text!r}.", field=f"replay {key}", hint="give a number") from error
         own = "&".join(pair for pair in pairs if pair.partition("=")[0] not in kinds)
-        return cls(open_log(log + (f"?{own}" if own else "")), ReplayOptions(**values))
+        recording = open_log(log + (f"?{own}" if own else ""), joint_delay=joint_delay)
+        return cls(recording, ReplayOptions(**values))
 
     def close(self) -> None:
         """End the stream; a waiting reader receives no further frame."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from splatbot.frame import Frame
@@ -18,6 +19,7 @@ from splatbot.services.ros.rosapi import RosApi
 from splatbot.services.ros.subscribers import MAX_PIXELS, RosSubscribers
 from splatbot.services.ros.tf_republisher import TfRepublisher
 from splatbot.services.store import MapStore
+from splatbot.services.topics import JOINTS, JointState, robot_topic
 
 
 class RosNode:
@@ -28,6 +30,7 @@ class RosNode:
         arms: executes the motions that clients send. If None, they are refused.
         robot: whose joints /joint_states are, and which plans are made for where a request names none.
         on_frame: called with each frame that clients publish. If None, frames are not mapped.
+        on_joints: called with the robot's name and its joints that clients publish. If None, the bus receives them.
         max_pixels: of an image that clients publish.
     """
 
@@ -38,6 +41,7 @@ class RosNode:
         arms: Arms | None = None,
         robot: str = "panda",
         on_frame: Callable[[Frame], Any] | None = None,
+        on_joints: Callable[[str, JointState], Any] | None = None,
         max_pixels: int = MAX_PIXELS,
     ) -> None:
         self.graph = RosGraph()
@@ -48,10 +52,12 @@ class RosNode:
         follow = FollowJointTrajectory(self.graph, arms, store) if arms is not None else None
         if arms is not None:
             EmergencyStopTopic(self.graph, arms)
+        publish = partial(store.bus.publish, robot_topic(robot, JOINTS))
+        take_joints = publish if on_joints is None else partial(on_joints, robot)
         self._parts: list[TfRepublisher | RosPublishers | RosSubscribers | FollowJointTrajectory] = [
             TfRepublisher(self.graph),
             RosPublishers(store.bus, self.graph),
-            RosSubscribers(self.graph, store.bus, robot=robot, on_frame=on_frame, max_pixels=max_pixels),
+            RosSubscribers(self.graph, take_joints, on_frame=on_frame, max_pixels=max_pixels),
         ]
         if follow is not None:
             self._parts.append(follow)

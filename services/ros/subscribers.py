@@ -15,15 +15,13 @@ from splatbot.logs.index import MAX_STAMP_DIFFERENCE_S
 from splatbot.logs.mcap import COLOR, DEPTH, INFO, JOINTS
 from splatbot.logs.ros_frames import camera_of, color_of, depth_of, seconds_of, size_of
 from splatbot.logs.undistort import Undistorter
-from splatbot.services.bus import Bus
 from splatbot.services.problems import BusyError, TooLargeError
 from splatbot.services.ros.graph import RosGraph
 from splatbot.services.ros.messages import joints_of
 from splatbot.services.ros.publishers import FROM_ROS
 from splatbot.services.ros.wire import RosMessage
 from splatbot.services.threads import join_started
-from splatbot.services.topics import JOINTS as ROBOT_JOINTS
-from splatbot.services.topics import robot_topic
+from splatbot.services.topics import JointState
 
 MAX_PIXELS = 2_100_000  # of an image, unless the settings of the service say otherwise
 _WAITING = 16
@@ -32,15 +30,14 @@ _log = logging.getLogger(__name__)
 
 
 class RosSubscribers:
-    """A thread that builds frames from clients' images and publishes their joint states on the bus.
+    """A thread that builds frames from clients' images and takes their joint states.
 
     A frame is a colour image, the depth image nearest in time (within 0.02 s) and the latest CameraInfo. Unusable
     messages are logged, which also reaches /rosout.
 
     Args:
         graph: where clients publish.
-        bus: receives the joints.
-        robot: whose joints /joint_states are.
+        on_joints: called with the joints of /joint_states.
         on_frame: called with each frame. If None, images are only forwarded to other clients.
         max_pixels: of an image.
     """
@@ -48,13 +45,12 @@ class RosSubscribers:
     def __init__(
         self,
         graph: RosGraph,
-        bus: Bus,
+        on_joints: Callable[[JointState], Any],
         *,
-        robot: str = "panda",
         on_frame: Callable[[Frame], Any] | None = None,
         max_pixels: int = MAX_PIXELS,
     ) -> None:
-        self._bus, self._robot, self._on_frame = bus, robot, on_frame
+        self._on_joints, self._on_frame = on_joints, on_frame
         self.dropped = 0
         self._pairs = FramePairs(max_pixels)
         self._news = graph.subscribe(COLOR, DEPTH, INFO, JOINTS, capacity=_WAITING)
@@ -85,7 +81,7 @@ class RosSubscribers:
 
     def _take(self, topic: str, value: RosMessage) -> None:
         if topic == JOINTS:
-            self._bus.publish(robot_topic(self._robot, ROBOT_JOINTS), joints_of(value.message))
+            self._on_joints(joints_of(value.message))
         elif self._on_frame is not None and (frame := self._pairs.add(topic, value.message)) is not None:
             self._on_frame(frame)
 

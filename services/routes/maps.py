@@ -17,6 +17,8 @@ from starlette.responses import FileResponse
 
 from splatbot.errors import InputError, MapNotFoundError
 from splatbot.formats import WRITTEN, save_gaussians
+from splatbot.logs import open_log
+from splatbot.services.arms import known_robot
 from splatbot.services.codecs import ZIP, answer, answers, body_of, request_body
 from splatbot.services.dependencies import (
     IdempotencyKey,
@@ -33,11 +35,13 @@ from splatbot.services.heap import trim_heap
 from splatbot.services.library import check_id
 from splatbot.services.mapping import check_length, map_recording, map_upload, workspace_of
 from splatbot.services.problems import MapNotReadyError, TooLargeError
-from splatbot.services.recordings import open_allowed
+from splatbot.services.recordings import allowed_log
+from splatbot.services.robot_mask import RobotMask
 from splatbot.services.routes.jobs import accepted, starts
-from splatbot.services.schemas import Bounds, MapInfo, MapList, MapRequest
+from splatbot.services.schemas import Bounds, MapInfo, MapList, MapRequest, RobotInView, RobotMaskInfo
 from splatbot.services.scratch import Scratch
 from splatbot.services.store import ServedMap
+from splatbot.workspace import find_workspace
 
 router = APIRouter(prefix="/v1/maps", tags=["maps"])
 
@@ -52,12 +56,21 @@ _EXAMPLE: dict[str, Any] = {
     "sh_degree": 0,
     "stamp": 1.3,
     "bounds": {"low": [-0.8, -0.5, 0.4], "high": [0.9, 0.4, 1.9]},
+    "robot": {"name": "panda", "masked": 118, "refused": 2, "problem": None},
 }
 _CREATE = {
     "a synthetic log": {"id": "tabletop", "log": "synthetic:tabletop?frames=8&width=160&height=120"},
     "frames that will be pushed": {
         "id": "robot",
         "robot_base": {"translation": [0.0, 0.5, 0.0], "quaternion_wxyz": [1.0, 0.0, 0.0, 0.0]},
+    },
+    "frames of a camera that sees the robot": {
+        "id": "wrist",
+        "robot": {
+            "name": "panda",
+            "T_link_camera": {"translation": [0.05, 0.0, 0.05], "quaternion_wxyz": [1.0, 0.0, 0.0, 0.0]},
+            "joint_delay": 0.02,
+        },
     },
 }
 _FILE: dict[int | str, dict[str, Any]] = {200: {"content": {"application/octet-stream": {}}, "description": "the file"}}
@@ -85,24 +98,25 @@ def create_map(
     check_id(query.id)
     base = query.robot_base.matrix("robot_base") if query.robot_base is not None else None
     if query.log is None:
-        served = service.open_stream(query.id, workspace=workspace_of("synthetic:", base))
+        mask = _mask(query.robot, None)
+        served = service.open_stream(query.id, workspace=workspace_of("synthetic:", base), mask=mask)
         place = {"Location": f"/v1/maps/{query.id}"}
         return Response(_info(served).model_dump_json(), 201, place, media_type="application/json")
     request = query.model_dump_json()
     known = service.jobs.known(key, request)
     if known is not None:
         return accepted(known)
-    settings = service.settings
-    log = open_allowed(
-        query.log,
-        settings.log_roots,
-        camera=query.camera,
-        max_frames=settings.max_frames,
-        max_pixels=settings.max_pixels,
+    limits = service.settings
+    uri = allowed_log(
+        query.log, limits.log_roots, camera=query.camera, max_frames=limits.max_frames, max_pixels=limits.max_pixels
     )
-    total = check_length(log, service.settings.max_frames, query.max_frames)
-    workspace = workspace_of(log.uri, base)
-    served = service.store.add(query.id, source=log.name, state="mapping", workspace=workspace, awaited=False)
+    mask = _mask(query.robot, uri)
+    log = open_log(uri, camera=query.camera, joint_delay=0.0 if mask is None else mask.joint_delay)
+    total = check_length(log, limits.max_frames, query.max_frames)
+    workspace = workspace_of(uri, base)
+    served = service.store.add(
+        query.id, source=log.name, state="mapping", workspace=workspace, mask=mask, awaited=False
+    )
     try:
         work = map_recording(service, served, log, total)
         return accepted(
@@ -259,4 +273,17 @@ def _info(served: ServedMap) -> MapInfo:
         sh_degree=snapshot.model.sh_degree if snapshot else 0,
         stamp=snapshot.stamp if snapshot else 0.0,
         bounds=bounds,
+        robot=None if served.mask is None else _masked(served.mask),
     )
+
+
+def _masked(mask: RobotMask) -> RobotMaskInfo:
+    return RobotMaskInfo(name=mask.robot.name, masked=mask.masked, refused=mask.refused, problem=mask.problem)
+
+
+def _mask(robot: RobotInView | None, uri: str | None) -> RobotMask | None:
+    """Return the mask of a robot in view of a camera, which the request or the recording's scene.yaml describes."""
+    if robot is None:
+        return None
+    known = None if uri is None or uri.startswith("synthetic:") else find_workspace(uri)
+    return RobotMask(known_robot(robot.name), robot.workspace(known))

@@ -11,7 +11,7 @@ import numpy as np
 from splatbot.errors import FormatError, InputError
 from splatbot.geometry import inverse, nearest_rotation, so3_log
 from splatbot.logs.calibration import read_object
-from splatbot.logs.joints import JointRecord, find_joints
+from splatbot.logs.joints import JointRecord, find_joints, select_joints
 from splatbot.protocols import Array
 from splatbot.robots.robot import RobotModel
 from splatbot.trajectory import Trajectory
@@ -87,6 +87,8 @@ class ArmRecord:
             InputError: the arm in the log has another number of joints.
         """
         q = None if self.joints is None else self.joints.at(stamp)
+        if q is not None and self.joints is not None and self.joints.names:
+            return select_joints(self.joints.names, q, robot.chain.names)
         if q is not None and len(q) != len(robot):
             raise InputError(
                 f"has {len(q)} joints, {robot.name} has {len(robot)}.", field="joints.txt", hint="name the arm: --robot"

@@ -32,11 +32,13 @@ class ArmView:
 
     Args:
         joints: (J,) [rad or m], if known.
+        joint_names: their names; if empty, they are in the order of the robot.
         T_base_link: (4, 4) [m], if known.
     """
 
     joints: Array | None = None
     T_base_link: Array | None = None
+    joint_names: tuple[str, ...] = ()
 
 
 class ViewSource:
@@ -88,7 +90,7 @@ class ViewSource:
             except LogError as error:
                 damaged, self.skipped = error, self.skipped + 1
                 continue
-            yield share, ArmView(frame.joints), frame.rgb
+            yield share, ArmView(frame.joints, joint_names=frame.joint_names), frame.rgb
         if damaged is not None and self.skipped == len(chosen):
             raise damaged
 

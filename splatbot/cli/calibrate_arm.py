@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from splatbot.calibration.hand_eye import HandEyeCalibration
     from splatbot.calibration.link_motion import LinkMotion
     from splatbot.calibration.measurements import BoardMeasurement, Measurement, PoseMeasurement
-    from splatbot.calibration.views import BoardRecording, ViewSource
+    from splatbot.calibration.views import ArmView, BoardRecording, ViewSource
     from splatbot.camera import Camera
     from splatbot.protocols import Array, RobotKinematics
     from splatbot.workspace import Workspace
@@ -217,7 +217,7 @@ def _board_problem(
     else:
         lens = _camera(camera, recording.size)
     seen = [(at, view) for at, view in zip(recording.arms, recording.views, strict=True) if view.usable]
-    known = [(at.T_base_link if arm is None else at.joints, view) for at, view in seen]
+    known = [(at.T_base_link if arm is None else _ordered(at, arm), view) for at, view in seen]
     values, views = [value for value, _ in known if value is not None], [v for value, v in known if value is not None]
     if not values:
         hint = "give --robot NAME and joints with the images" if arm is None else "write joint_values: [q1, ...]"
@@ -226,6 +226,14 @@ def _board_problem(
         raise InputError("differ in number.", file=source, field="joints", hint="write all joints for each image")
     motion = PoseLinkMotion(np.array(values)) if arm is None else _by_joints(arm, np.array(values), link, source)
     return motion, BoardMeasurement(tuple(views), lens, not eye_to_hand)
+
+
+def _ordered(at: ArmView, arm: RobotKinematics) -> Array | None:
+    from splatbot.logs.joints import select_joints
+
+    if at.joints is None or not at.joint_names:
+        return at.joints
+    return select_joints(at.joint_names, at.joints, arm.chain.names)
 
 
 def _by_joints(arm: RobotKinematics, joints: Array, link: int, source: str, stamps: Array | None = None) -> LinkMotion:
@@ -283,7 +291,8 @@ def _tracked_problem(
         if arm is None:
             raise InputError("needs the arm of the joints.", file=joints, field="--robot", hint="give --robot NAME")
         record = JointRecord(joints)
-        motion = _by_joints(arm, record.joints, link, str(joints), record.stamps)
+        positions = record.ordered(arm.chain.names) if record.names else record.joints
+        motion = _by_joints(arm, positions, link, str(joints), record.stamps)
     else:
         recorded = load_trajectory(str(poses), unordered=True)
         motion = PoseLinkMotion(recorded.T_world_camera, recorded.stamps)

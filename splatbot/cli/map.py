@@ -102,15 +102,14 @@ def map_log_command(
 
     from splatbot.cli.map_page import page_of_map
     from splatbot.cli.progress import progress_display
-    from splatbot.logs import open_log
-    from splatbot.robots.in_view import without_robot
+    from splatbot.robots.in_view import open_without_robot
     from splatbot.run import map_log
 
     saved = _saved_run(resume, localise)
     if resume is not None and saved is not None:
         log, camera, out = log or saved.place.uri, camera or saved.place.camera, out or resume
         robot = robot or saved.place.robot
-    recording = without_robot(open_log(log, camera=camera), robot)
+    recording = open_without_robot(log, robot, camera=camera)
     if not quiet:
         for doubt in camera_doubts(recording.camera):
             print_message("question", doubt)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -33,6 +34,8 @@ def serve(
     ros_port: Annotated[int | None, tyro.conf.arg(metavar="PORT")] = None,
     viewer_port: Annotated[int | None, tyro.conf.arg(metavar="PORT")] = None,
     record: Annotated[Path | None, tyro.conf.arg(metavar="MCAP")] = None,
+    robot: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None,
+    scene: Annotated[Path | None, tyro.conf.arg(metavar="YAML")] = None,
     config: Annotated[Path | None, tyro.conf.arg(metavar="YAML")] = None,
     service_config: Annotated[Path | None, tyro.conf.arg(metavar="YAML")] = None,
     insecure_no_auth: bool = False,
@@ -44,6 +47,7 @@ def serve(
     Examples:
         splatbot serve --map runs/demo/map.ply
         splatbot serve --log recordings/desk --port 8080
+        splatbot serve --log recordings/wrist --robot panda
         splatbot serve --camera "replay:recordings/desk?loop=1" --viewer-port 8001 --ros-port 9090
         SPLATBOT_LOG_ROOTS=recordings splatbot serve --data maps
         splatbot serve --new-key --scopes read,move
@@ -63,6 +67,10 @@ def serve(
         ros_port: additional port for roslib clients that need a separate one (usually 9090). rosbridge is always at
             /rosbridge of --port, Foxglove at /foxglove.
         viewer_port: show the map in the browser at this port, on this machine alone. The page needs a key.
+        robot: mask this robot in the frames of --log, of a camera and of ROS topics, by its joint states at the time of
+            each image, or SPLATBOT_ROBOT. A frame without them is not mapped.
+        scene: scene.yaml with T_link_camera, the camera on the robot's link, and joint_delay; by default that of the
+            log's folder.
         record: record every topic into this MCAP file, from which the frames can be mapped again.
         config: YAML file with the configuration of mapping.
         service_config: YAML file with the service's address, keys and limits.
@@ -82,18 +90,20 @@ def serve(
         check_camera(camera)
     check_file(config, "--config")
     check_file(service_config, "--service-config")
+    check_file(scene, "--scene")
     check_output(data, "--data")
     check_output(record, "--record", folder=False)
 
     from splatbot.config import load_config
     from splatbot.logs import open_log
-    from splatbot.robots.cameras import is_camera, open_camera
+    from splatbot.robots.cameras import PREFIX, is_camera, open_camera
     from splatbot.services.requests import configure_logging
     from splatbot.services.runtime import Runtime, check_exposure
     from splatbot.services.server import run_service
     from splatbot.services.settings import load_settings
 
     given = {"host": host, "port": port, "ros_port": ros_port, "viewer_port": viewer_port, "record": record}
+    given |= {"robot": robot, "scene": scene}
     given["insecure_no_auth"] = insecure_no_auth or None
     settings = load_settings(service_config, data_dir=data, **given)
     configure_logging(as_json=settings.log_json)
@@ -107,9 +117,9 @@ def serve(
     if map is not None:
         _add_map(runtime, map)
     elif device is not None:
-        _follow(runtime, open_camera(device))
+        _follow(runtime, device.removeprefix(PREFIX), lambda delay: open_camera(device, joint_delay=delay))
     elif log is not None:
-        _follow(runtime, open_log(log, camera=camera))
+        _follow(runtime, log, lambda delay: open_log(log, camera=camera, joint_delay=delay))
     try:
         run_service(runtime, on_start=partial(_announce, settings))
     finally:
@@ -134,13 +144,15 @@ def _add_map(runtime: Runtime, map_: Path) -> None:
     )
 
 
-def _follow(runtime: Runtime, source: Log | FrameSource) -> None:
-    from splatbot.robots.cameras.replay import PREFIX
+def _follow(runtime: Runtime, log: str, open_source: Callable[[float], Log | FrameSource]) -> None:
+    """Map a log or a camera, opened with the delay of its joints; the scene is that of the settings or of the log."""
     from splatbot.services.mapping import workspace_of
     from splatbot.slam import Slam
 
-    workspace = workspace_of(source.uri.removeprefix(PREFIX), None)
-    served = runtime.store.add(MAP_ID, source=source.name, state="mapping", workspace=workspace)
+    workspace = runtime.workspace or workspace_of(log.partition("?")[0], None)
+    mask = runtime.new_mask(workspace)
+    source = open_source(0.0 if mask is None else mask.joint_delay)
+    served = runtime.store.add(MAP_ID, source=source.name, state="mapping", workspace=workspace, mask=mask)
     runtime.follow(served, source, Slam(runtime.config))
 
 

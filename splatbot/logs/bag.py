@@ -21,7 +21,7 @@ from splatbot.frame import Frame
 from splatbot.logs.base import MILLIMETRES, StampedLog
 from splatbot.logs.calibration import Calibration
 from splatbot.logs.index import MAX_STAMP_DIFFERENCE_S, associate
-from splatbot.logs.joints import interpolate_joints
+from splatbot.logs.joints import JointStates
 from splatbot.logs.mcap import COLOR, DEPTH, INFO, JOINTS, MASK, TRUTH
 from splatbot.logs.mcap_storage import check_checksums
 from splatbot.logs.presets import find_calibration
@@ -64,6 +64,7 @@ class BagLog(StampedLog):
         path: the file or folder.
         camera: intrinsics that replace the recorded CameraInfo.
         topics: topics to read by the keys `color`, `depth`, `info` and `joints`, needed if the recording has several.
+        joint_delay: time [s] by which the stamps of joint positions are later than their motion.
 
     Raises:
         LogError: the file is missing or damaged, a topic is missing or ambiguous, or nothing can be paired.
@@ -76,8 +77,9 @@ class BagLog(StampedLog):
         *,
         camera: str | Path | Calibration | None = None,
         topics: dict[str, str] | None = None,
+        joint_delay: float = 0.0,
     ) -> None:
-        self.path = Path(path)
+        self.path, self._joint_delay = Path(path), joint_delay
         self._given = dict(topics or {})
         self.uri = str(path) + ("?" + "&".join(f"{k}={v}" for k, v in self._given.items()) if self._given else "")
         self.name = self.path.stem
@@ -125,7 +127,7 @@ class BagLog(StampedLog):
         if self._undistort:
             rgb, z = self._undistort.color(rgb), self._undistort.depth(z)
             mask = None if mask is None else self._undistort.mask(mask)
-        joints = None if self._joints is None else interpolate_joints(*self._joints, color.stamp)
+        names, joints = self._joints.at(color.stamp + self._joint_delay) or ((), None)
         try:
             return Frame(
                 color.stamp,
@@ -137,20 +139,18 @@ class BagLog(StampedLog):
                 mask=mask,
                 source=where,
                 depth_delay=depth.stamp - color.stamp,
+                joint_names=names,
             )
         except InputError as error:
             raise LogError(error.message, file=where, field=error.field, hint=error.hint) from error
 
     @cached_property
-    def _joints(self) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-        """Stamps (N,) [s] and positions (N, J) [rad] of the joint states with the joint count of the first."""
+    def _joints(self) -> JointStates:
         topic = self._given.get("joints", JOINTS)
-        if topic not in self._reader.topics:
-            return None
-        rows = {seconds_of(m.header.stamp): np.asarray(m.position, np.float64) for m in self._all(topic)}
-        size = len(next(iter(rows.values()), ()))
-        kept = sorted((stamp, row) for stamp, row in rows.items() if len(row) == size and size)
-        return (np.array([s for s, _ in kept]), np.stack([q for _, q in kept])) if kept else None
+        messages = self._all(topic) if topic in self._reader.topics else ()
+        return JointStates(
+            (seconds_of(m.header.stamp), tuple(m.name), np.asarray(m.position, np.float64)) for m in messages
+        )
 
     def _mask(self, stamp: float) -> NDArray[np.bool_] | None:
         entry = next((e for e in self._index.get(MASK, ()) if e.stamp == stamp), None)

@@ -1,20 +1,25 @@
-"""Joint positions of a log in TUM layout: `joints.txt`, lines `stamp q1 q2 ...` [s, rad]."""
+"""Joint positions over time: `joints.txt` of the TUM layout, and the joint states of several publishers."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from splatbot.errors import LogError
+from splatbot.errors import InputError, LogError
 
 NAME = "joints.txt"
+_HEADER = "# stamp"
 MAX_GAP = 0.1  # [s] to the neighbouring lines beyond which joint positions are not interpolated
 
 
 class JointRecord:
     """Joint positions over time with linear interpolation: ``stamps`` (N,) [s] and ``joints`` (N, J) [rad].
+
+    Lines are `stamp q1 q2 ...`. A first line `# stamp NAME NAME ...` gives the joints' ``names``; without it they are
+    empty, and the positions are in the robot's order.
 
     Args:
         path: the file.
@@ -48,10 +53,90 @@ class JointRecord:
             raise LogError("is empty.", file=path, hint="write lines `stamp q1 q2 ...`, or remove it")
         table = np.array(rows)
         self.stamps, self.joints = table[:, 0], table[:, 1:]
+        self.names = _names(lines[0], self.joints.shape[1])
 
     def at(self, stamp: float) -> NDArray[np.float64] | None:
         """Interpolate the positions (J,) [rad] at a stamp [s]; None if a neighbouring line is more than 0.1 s away."""
         return interpolate_joints(self.stamps, self.joints, stamp)
+
+    def ordered(self, wanted: Sequence[str]) -> NDArray[np.float64]:
+        """Return all positions (N, J) of the ``wanted`` joints; see :func:`select_joints`.
+
+        Raises:
+            InputError: a joint is missing.
+        """
+        columns = select_joints(self.names, np.arange(self.joints.shape[1], dtype=np.float64), wanted)
+        return self.joints[:, columns.astype(int)]
+
+
+def joint_header(names: Iterable[str]) -> str:
+    """Return the first line of a `joints.txt` whose columns have names."""
+    return " ".join((_HEADER, *names))
+
+
+def _names(line: str, count: int) -> tuple[str, ...]:
+    found = tuple(line.removeprefix(_HEADER).split()) if line.startswith(f"{_HEADER} ") else ()
+    return found if len(found) == count else ()
+
+
+class JointStates:
+    """Joint positions of any number of publishers, each with its own joints and rate.
+
+    Args:
+        states: stamp [s], names and positions [rad or m] of each message, in any order. Messages without positions,
+            with values that are not finite or with another number of names are left out; names may be empty.
+    """
+
+    def __init__(self, states: Iterable[tuple[float, Sequence[str], NDArray[np.float64]]]) -> None:
+        rows: dict[tuple[tuple[str, ...], int], dict[float, NDArray[np.float64]]] = {}
+        for stamp, names, positions in states:
+            if len(positions) and len(names) in (0, len(positions)) and np.isfinite(positions).all():
+                rows.setdefault((tuple(names), len(positions)), {})[stamp] = positions
+        self._publishers = []
+        for (names, _), found in rows.items():
+            stamps = sorted(found)
+            self._publishers.append((names, np.array(stamps), np.stack([found[stamp] for stamp in stamps])))
+
+    def at(self, stamp: float) -> tuple[tuple[str, ...], NDArray[np.float64]] | None:
+        """Interpolate all joints that are known at a stamp [s]: names, and positions (J,) [rad or m]; see JointRecord.
+
+        Joints without names are only those of the first publisher without names, and only if no joint has a name.
+        """
+        found = [(names, interpolate_joints(stamps, joints, stamp)) for names, stamps, joints in self._publishers]
+        named: dict[str, float] = {}
+        for names, positions in found:
+            if positions is not None:
+                named |= {name: float(q) for name, q in zip(names, positions, strict=False) if name not in named}
+        if named:
+            return tuple(named), np.array(list(named.values()))
+        return next((((), positions) for names, positions in found if not names and positions is not None), None)
+
+
+def select_joints(names: Sequence[str], positions: NDArray[np.float64], wanted: Sequence[str]) -> NDArray[np.float64]:
+    """Return the positions (J,) of the ``wanted`` joints, in their order.
+
+    Positions without names, or named joint1, joint2, ... as recordings without names are written, are in the order of
+    the robot already; those of a gripper may follow.
+
+    Raises:
+        InputError: a joint is missing.
+    """
+    generic = not set(names) & set(wanted) and list(names) == [f"joint{k + 1}" for k in range(len(names))]
+    if not len(names) or generic:
+        if len(positions) < len(wanted):
+            raise InputError(
+                f"has {len(positions)} joints.", field="joints", hint=f"give {len(wanted)}: {', '.join(wanted)}"
+            )
+        return np.asarray(positions[: len(wanted)], np.float64)
+    known = dict(zip(names, np.asarray(positions, np.float64).tolist(), strict=True))
+    missing = [name for name in wanted if name not in known]
+    if missing:
+        raise InputError(
+            f"has no joint {', '.join(missing)}.",
+            field="joints",
+            hint=f"its joints are {', '.join(names)}; list those of the robot as joint_names in scene.yaml",
+        )
+    return np.array([known[name] for name in wanted])
 
 
 def interpolate_joints(

@@ -105,7 +105,7 @@ def record_mcap(log: Log, path: str | Path, *, progress: Progress | None = None)
             if frame.mask is not None:
                 out.write(MASK, image_message(frame.stamp, frame.mask), at)
             if frame.joints is not None:
-                out.write(JOINTS, joint_state_message(frame.stamp, frame.joints), at)
+                out.write(JOINTS, joint_state_message(frame.stamp, frame.joints, frame.joint_names), at)
             if progress is not None:
                 progress(number)
     return out.path

@@ -18,6 +18,7 @@ from splatbot.errors import LogError
 from splatbot.frame import Frame
 from splatbot.logs.base import Log
 from splatbot.logs.joints import NAME as JOINTS
+from splatbot.logs.joints import joint_header
 from splatbot.trajectory import Trajectory
 
 Progress = Callable[[int], None]
@@ -61,6 +62,7 @@ def record(
     if truth is not None:
         truth.save(out / "groundtruth.txt")
     camera = None
+    names: tuple[str, ...] | None = None  # of the joints, from the first frame that has any
     (out / "depth.txt").unlink(missing_ok=True)  # of a recording that was cut off before its first colour image
     with _LineFile(out / "depth.txt") as depths, _LineFile(out / "rgb.txt") as colors:
         for number, frame in enumerate(frames):
@@ -71,8 +73,8 @@ def record(
                 raise LogError("the camera changed.", file=frame.source, field="camera", hint="record two logs")
             name = f"{number:06d}.png"
             if frame.joints is not None:
-                with _LineFile(out / JOINTS) as lines:
-                    lines.append(" ".join(repr(float(v)) for v in (frame.stamp, *frame.joints)))
+                names = frame.joint_names if names is None else names
+                _append_joints(out / JOINTS, frame, names)
             _write_png(out / "rgb" / name, cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2BGR))
             _write_png(out / "depth" / name, _to_units(frame, depth_scale))
             # Depth first: a depth image without colour is harmless, but colour without depth is an error.
@@ -81,6 +83,20 @@ def record(
             if progress is not None:
                 progress(number + 1)
     return out
+
+
+def _append_joints(path: Path, frame: Frame, names: tuple[str, ...]) -> None:
+    """Append the positions of the named joints; a frame that lacks one of them gets no line."""
+    assert frame.joints is not None
+    values = dict(zip(frame.joint_names, frame.joints.tolist(), strict=True)) if frame.joint_names else {}
+    if set(names) - set(values):
+        return
+    known = [values[name] for name in names] if names else frame.joints.tolist()
+    begins = bool(names) and not path.exists()
+    with _LineFile(path) as lines:
+        if begins:
+            lines.append(joint_header(names))
+        lines.append(" ".join(repr(float(v)) for v in (frame.stamp, *known)))
 
 
 class _LineFile:

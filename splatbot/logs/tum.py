@@ -46,13 +46,24 @@ class TumLog(FolderLog, StampedLog):
 
     `joints.txt` (lines `stamp q1 q2 ...`) holds the joint positions, which are interpolated to each frame's stamp.
 
+    Args:
+        folder: of the log.
+        camera: intrinsics that replace the log's own.
+        missing: see above.
+        joint_delay: time [s] by which the stamps of joint positions are later than their motion.
+
     Raises:
         LogError: a list is missing, empty or malformed, nothing can be associated, or `effects.json` is damaged.
         CameraError: there are no usable intrinsics.
     """
 
     def __init__(
-        self, folder: str | Path, *, camera: str | Path | Calibration | None = None, missing: Missing = "auto"
+        self,
+        folder: str | Path,
+        *,
+        camera: str | Path | Calibration | None = None,
+        missing: Missing = "auto",
+        joint_delay: float = 0.0,
     ) -> None:
         super().__init__(folder)
         colors, self._depths = read_index(self.folder / "rgb.txt"), read_index(self.folder / "depth.txt")
@@ -65,7 +76,7 @@ class TumLog(FolderLog, StampedLog):
         self._frames: list[tuple[IndexEntry, IndexEntry | None]] = [(colors[i], pairs.get(i)) for i in kept]
         self.stamps = [color.stamp for color, _ in self._frames]
         self._masks = find_masks(self.folder)
-        self._joints = find_joints(self.folder)
+        self._joints, self._joint_delay = find_joints(self.folder), joint_delay
         self._effects, blanks_depth = read_account(self.folder)
         self._reader = RgbdReader(self._calibration(camera), empty_depth=blanks_depth)
         self._report(len(colors), len(pairs))
@@ -92,7 +103,9 @@ class TumLog(FolderLog, StampedLog):
         mask = None if self._masks is None else self._masks.at(color.stamp)
         frame = self._reader.read(index, color.stamp, self.folder / color.path, self.folder / depth.path, mask)
         frame = replace(frame, depth_delay=depth.stamp - color.stamp)
-        return frame if self._joints is None else replace(frame, joints=self._joints.at(color.stamp))
+        if self._joints is None:
+            return frame
+        return replace(frame, joints=self._joints.at(color.stamp + self._joint_delay), joint_names=self._joints.names)
 
     def _pair(self, colors: list[IndexEntry]) -> dict[int, IndexEntry]:
         a, b = (np.array([entry.stamp for entry in entries]) for entries in (colors, self._depths))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,9 +13,16 @@ from splatbot.collision import RobotSpheres
 from splatbot.errors import InputError
 from splatbot.frame import Frame
 from splatbot.geometry import inverse, transform_points
+from splatbot.logs.joints import select_joints
 from splatbot.protocols import Array, RobotKinematics
 
 REACH = 0.02  # [m] distance from the robot's spheres that counts as the robot
+
+
+class JointsUnknownError(InputError):
+    """The joints of the robot at the time of a frame are not known, so its pixels are not known either."""
+
+    http_status = 409
 
 
 class SelfMask:
@@ -30,10 +38,12 @@ class SelfMask:
         opening: opening of the gripper [m]. If None, the gripper is fully open.
         reach: enlargement of the spheres [m].
         joint_offsets: (J,) added to measured joint positions [rad or m]; see `splatbot calibrate hand-eye`.
+        joint_names: (J,) names of the robot's joints in the frames, if they are not those of its model.
+        held: (A, 4) spheres (x, y, z, radius) [m] of an object in the hand, in the frame of the last link.
 
     Raises:
-        InputError: The camera pose is not rigid, the link does not exist, the reach is negative, or the offsets are not
-            one for each joint.
+        InputError: The camera pose is not rigid, the link does not exist, the reach is negative, or offsets or names
+            are not one for each joint.
     """
 
     def __init__(
@@ -45,6 +55,8 @@ class SelfMask:
         opening: float | None = None,
         reach: float = REACH,
         joint_offsets: ArrayLike | None = None,
+        joint_names: Sequence[str] = (),
+        held: ArrayLike | None = None,
     ) -> None:
         links = len(robot.chain) + 1
         if not -links <= link < links:
@@ -60,7 +72,11 @@ class SelfMask:
         if self._offsets.shape != (links - 1,) or not np.isfinite(self._offsets).all():
             shape = self._offsets.shape
             raise InputError(f"is {shape}.", field="joint_offsets", hint=f"{robot.name} has {links - 1} joints")
-        self._arm = RobotSpheres(robot, opening=opening)
+        self._names = tuple(joint_names) or tuple(robot.chain.names)
+        if len(self._names) != links - 1:
+            hint = f"{robot.name} has {links - 1} joints"
+            raise InputError(f"has {len(self._names)} names.", field="joint_names", hint=hint)
+        self._arm = RobotSpheres(robot, opening=opening, attached=held)
         self._T_link_camera, self._link, self._reach = T, link % links, reach
         self._radii = self._arm.spheres.radii + reach
 
@@ -68,7 +84,7 @@ class SelfMask:
         """Return the frame with the robot removed from its mask.
 
         Raises:
-            InputError: The frame has no joints or too few.
+            JointsUnknownError: The frame has no joints or too few.
         """
         free = self.usable(frame)
         return replace(frame, mask=free if frame.mask is None else frame.mask & free)
@@ -77,15 +93,16 @@ class SelfMask:
         """Compute the pixels (H, W) that do not show the robot.
 
         Raises:
-            InputError: The frame has no joints or too few.
+            JointsUnknownError: The frame has no joints or too few.
         """
-        joints = len(self._arm.robot.chain)
         where = frame.source or f"frame {frame.index}"
-        if frame.joints is None or len(frame.joints) < joints:
-            count = "no" if frame.joints is None else str(len(frame.joints))
+        if frame.joints is None:
             hint = f"record the joints of {self._arm.robot.name} with the frames, or map without its mask"
-            raise InputError(f"has {count} joints.", file=where, field="joints", hint=hint)
-        q = np.asarray(frame.joints[:joints], dtype=np.float64) + self._offsets  # a gripper's own may follow
+            raise JointsUnknownError("has no joints at its time.", file=where, field="joints", hint=hint)
+        try:
+            q = select_joints(frame.joint_names, frame.joints, self._names) + self._offsets
+        except InputError as error:
+            raise JointsUnknownError(error.message, file=where, field=error.field, hint=error.hint) from error
         T_base_camera = self._arm.forward(q)[0, self._link] @ self._T_link_camera
         centers = transform_points(inverse(T_base_camera), self._arm.centers(q)[0])
         hidden = np.zeros(frame.depth.shape, np.bool_)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from splatbot.errors import InputError, LogError
 from splatbot.frame import Frame
 from splatbot.logs import Log
 from splatbot.logs.base import DerivedLog
@@ -11,6 +12,8 @@ from splatbot.logs.base import DerivedLog
 
 class MaskedLog(DerivedLog):
     """The frames of a log, each gone through ``mask`` (see ``SelfMask``); otherwise that log.
+
+    A frame that the mask refuses is a damaged frame of the log: reading it raises LogError.
 
     Args:
         log: the recording.
@@ -22,4 +25,8 @@ class MaskedLog(DerivedLog):
         self._mask = mask
 
     def _decode(self, index: int) -> Frame:
-        return self._mask(self._log[index])
+        frame = self._log[index]
+        try:
+            return self._mask(frame)
+        except InputError as error:
+            raise LogError(error.message, file=error.file, field=error.field, hint=error.hint) from error

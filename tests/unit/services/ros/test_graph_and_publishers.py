@@ -20,7 +20,6 @@ from splatbot.logs import open_log
 from splatbot.logs.mcap import COLOR, DEPTH, INFO, JOINTS
 from splatbot.logs.ros_frames import camera_info_message, image_message, pose_of
 from splatbot.logs.ros_types import build, from_cdr, to_cdr, to_plain
-from splatbot.services.bus import Bus
 from splatbot.services.ros.graph import RosGraph
 from splatbot.services.ros.messages import (
     joint_trajectory_message,
@@ -149,10 +148,10 @@ def test_nobody_pays_for_messages_that_nobody_reads(told: tuple[MapStore, RosGra
     assert store.list() == ()
 
 
-def test_images_of_a_client_become_frames_and_joints_reach_the_bus(make_log: MakeLog) -> None:
-    graph, bus = RosGraph(), Bus()
+def test_images_of_a_client_become_frames_and_joint_states_are_taken(make_log: MakeLog) -> None:
+    graph, states = RosGraph(), list[JointState]()
     frames: list[Frame] = []
-    inlets = RosSubscribers(graph, bus, on_frame=frames.append)
+    inlets = RosSubscribers(graph, states.append, on_frame=frames.append)
     inlets.start()
     log = open_log(make_log())
     for frame in log:
@@ -164,8 +163,9 @@ def test_images_of_a_client_become_frames_and_joints_reach_the_bus(make_log: Mak
     graph.publish(COLOR, image_message(9.0, log[0].rgb))  # the service's own are left alone
     graph.publish(JOINTS, build("sensor_msgs/msg/JointState", name=["a", "b"], position=[0.5, 1.0]), client=1)
     graph.publish(JOINTS, build("sensor_msgs/msg/JointState", name=["a", "b"], position=[0.5]), client=1)
-    state: JointState = _until(lambda: bus.latest(robot_topic("panda", "joints"))).value
+    state: JointState = _until(lambda: states[0] if states else None)
     inlets.stop()
+    assert len(states) == 1
     assert (state.names, state.position.tolist()) == (("a", "b"), [0.5, 1.0])
     assert [f.stamp for f in frames] == pytest.approx([f.stamp for f in log], abs=1e-9)
     for a, b in zip(log, frames, strict=True):

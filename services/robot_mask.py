@@ -1,0 +1,194 @@
+"""The robot's own body in live frames: masked by the joint states at the time of each image."""
+
+from __future__ import annotations
+
+import bisect
+import logging
+import threading
+import time
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from splatbot.errors import InputError
+from splatbot.frame import Frame
+from splatbot.logs.joints import MAX_GAP, interpolate_joints, select_joints
+from splatbot.mapping.selfmask import JointsUnknownError
+from splatbot.protocols import FrameSource
+from splatbot.robots.in_view import self_mask
+from splatbot.robots.robot import RobotModel
+from splatbot.services.topics import JointState
+from splatbot.workspace import Workspace
+
+MAX_HELD = 64
+"""Largest number of spheres of an object in the hand."""
+_KEPT_S = 10.0  # [s] of joint states
+_KEPT = 20_000  # joint states: 2 kHz over that time
+_WAIT_S = 0.15  # [s] for the joint state after an image
+_REPORT_S = 10.0  # [s] between two warnings about frames that are not mapped
+
+_log = logging.getLogger(__name__)
+
+
+class JointHistory:
+    """The joint states of the last 10 s; any thread adds to it, and mapping reads it.
+
+    Args:
+        names: of the joints, in the robot's order.
+    """
+
+    def __init__(self, names: Iterable[str]) -> None:
+        self.names = tuple(names)
+        self._stamps: list[float] = []
+        self._positions: list[NDArray[np.float64]] = []
+        self._changed = threading.Condition()
+
+    def add(self, state: JointState) -> bool:
+        """Add a joint state, in any order. States from before a clock was set back are forgotten.
+
+        Returns:
+            False if the state has no joint of the robot, as that of a gripper.
+
+        Raises:
+            InputError: the state has only some joints of the robot, or a value is not finite.
+        """
+        try:
+            q = select_joints(state.names, np.asarray(state.position, np.float64), self.names)
+        except InputError:
+            if set(state.names).isdisjoint(self.names):
+                return False
+            raise
+        if not np.isfinite(q).all() or not np.isfinite(state.stamp):
+            raise InputError("has values that are not finite.", field="joints", hint="give seconds, radians and metres")
+        with self._changed:
+            if self._stamps and self._stamps[-1] - state.stamp > _KEPT_S:
+                self._stamps.clear()
+                self._positions.clear()
+            at = bisect.bisect_left(self._stamps, state.stamp)
+            if at < len(self._stamps) and self._stamps[at] == state.stamp:
+                self._positions[at] = q
+            else:
+                self._stamps.insert(at, state.stamp)
+                self._positions.insert(at, q)
+            old = max(bisect.bisect_left(self._stamps, self._stamps[-1] - _KEPT_S), len(self._stamps) - _KEPT)
+            del self._stamps[:old], self._positions[:old]
+            self._changed.notify_all()
+        return True
+
+    def at(self, stamp: float, wait_s: float) -> NDArray[np.float64]:
+        """Interpolate the positions (J,) [rad or m] at a stamp [s]; wait up to ``wait_s`` [s] for a later state.
+
+        Raises:
+            JointsUnknownError: no state within 0.1 s before the stamp, or none within 0.1 s after it.
+        """
+        with self._changed:
+            self._changed.wait_for(lambda: self._stamps and self._stamps[-1] >= stamp, wait_s)
+            after = bisect.bisect_left(self._stamps, stamp)
+            stamps = np.array(self._stamps[max(after - 1, 0) : after + 1])
+            joints = np.array(self._positions[max(after - 1, 0) : after + 1])
+            newest = self._stamps[-1] if self._stamps else None
+        between = len(stamps) > 0 and stamps[0] <= stamp <= stamps[-1]
+        found = interpolate_joints(stamps, joints, stamp) if between else None
+        if found is None:
+            known = "no joint state has come" if newest is None else f"the newest is {stamp - newest:+.3f} s before it"
+            hint = f"publish joint states with the images, with stamps of their clock, at {1 / MAX_GAP:.0f} Hz or more"
+            raise JointsUnknownError(
+                f"joint states at {stamp:.3f} s are missing or stale: {known}.", field="joints", hint=hint
+            )
+        return found
+
+
+class RobotMask:
+    """Masks the robot, and the object in its hand, in the frames of one live map.
+
+    A frame with joints of its own is masked by these. Otherwise its joints are those of the history at the frame's
+    stamp plus the workspace's ``joint_delay``. A frame without known joints is refused: it must not be mapped.
+
+    Args:
+        robot: the robot.
+        workspace: pose of the camera on its link, and names, offsets and delay of the joints.
+
+    Raises:
+        InputError: the pose of the camera is unknown, or the workspace does not fit the robot.
+    """
+
+    def __init__(self, robot: RobotModel, workspace: Workspace | None) -> None:
+        self._mask = self_mask(robot, workspace)
+        assert workspace is not None
+        self.robot, self._workspace = robot, workspace
+        self.history = JointHistory(workspace.joint_names or robot.chain.names)
+        self.masked = 0
+        self.refused = 0
+        self.problem: str | None = None
+        self._reported = -np.inf
+
+    @property
+    def joint_delay(self) -> float:
+        """Time [s] by which the stamps of joint states are later than the motion."""
+        return self._workspace.joint_delay
+
+    def __call__(self, frame: Frame) -> Frame:
+        """Return the frame with the robot masked.
+
+        Raises:
+            JointsUnknownError: the joints at the time of the frame are missing or stale.
+        """
+        try:
+            if frame.joints is None:
+                q = self.history.at(frame.stamp + self.joint_delay, _WAIT_S + max(self.joint_delay, 0.0))
+                frame = replace(frame, joints=q, joint_names=self.history.names)
+            masked = self._mask(frame)
+        except JointsUnknownError as error:
+            self._refuse(error)
+            raise
+        self.masked, self.problem = self.masked + 1, None
+        return masked
+
+    def hold(self, spheres: ArrayLike) -> None:
+        """Mask an object in the hand from the next frame on.
+
+        Args:
+            spheres: (A, 4) spheres (x, y, z, radius) [m] in the frame of the last link, at most 64; none to release.
+
+        Raises:
+            InputError: a sphere is invalid, or there are too many.
+        """
+        held = np.asarray(spheres, np.float64).reshape(-1, 4)
+        if len(held) > MAX_HELD:
+            raise InputError(f"has {len(held)} spheres.", field="spheres", hint=f"give at most {MAX_HELD}")
+        self._mask = self_mask(self.robot, self._workspace, held=held)
+
+    def _refuse(self, error: JointsUnknownError) -> None:
+        self.refused, self.problem = self.refused + 1, error.message
+        if time.monotonic() - self._reported >= _REPORT_S:
+            self._reported = time.monotonic()
+            _log.warning(
+                "%d frames are not mapped, because the robot in them cannot be masked: %s", self.refused, error
+            )
+
+
+class MaskedSource:
+    """The frames of a log or a camera with the robot masked; frames that the mask refuses are left out.
+
+    Args:
+        source: the frames.
+        mask: of their robot.
+    """
+
+    def __init__(self, source: Iterable[Frame], mask: RobotMask) -> None:
+        self._source, self._mask = source, mask
+        self.name, self.uri = str(getattr(source, "name", "")), str(getattr(source, "uri", ""))
+
+    def __iter__(self) -> Iterator[Frame]:
+        for frame in self._source:
+            try:
+                yield self._mask(frame)
+            except JointsUnknownError:
+                continue  # the mask counts and reports it
+
+    def close(self) -> None:
+        """End the stream of a camera; a log ends by itself."""
+        if isinstance(self._source, FrameSource):
+            self._source.close()
