@@ -83,10 +83,8 @@ def _report(recording: PublicRecording, found: Downloaded) -> None:
     elif found.pin is None:
         print_text(f"{found.folder}: complete; the archive has the sha256 of the catalogue")
     else:
-        print_text(
-            f"{found.folder}: complete; the catalogue has no sha256 of this archive, so nothing proves its origin"
-        )
-        print_text(f"later downloads must equal it: {found.pin}")
+        print_text(f"{found.folder}: complete; the catalogue has no sha256 of this archive, so that it was not checked")
+        print_text(f"{found.pin}: the sha256 that later downloads must equal")
     print(f"sha256 {found.sha256}")
     print_text(recording.terms)
     camera = f" --camera {recording.camera}" if recording.camera else ""

@@ -268,7 +268,7 @@ def _state_file(part: Path) -> Path:
 
 def _read_state(part: Path, url: str) -> _Partial | None:
     """Return the identity of the partial file; None if it is unknown, or of another address."""
-    with suppress(OSError, ValueError, TypeError):
+    with suppress(OSError, ValueError, TypeError, RecursionError):
         with _state_file(part).open("rb") as file:
             state = _Partial(**json.loads(file.read(_MAX_STATE)))
         if state.url == shown(url) and isinstance(state.validator, str) and _length(part) <= state.size:
