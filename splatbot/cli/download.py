@@ -86,6 +86,8 @@ def _report(recording: PublicRecording, found: Downloaded) -> None:
         print_text(f"{found.folder}: complete; the catalogue has no sha256 of this archive, so that it was not checked")
         print_text(f"{found.pin}: the sha256 that later downloads must equal")
     print(f"sha256 {found.sha256}")
+    if found.log != found.folder:
+        print_text(f"recordings in it: {', '.join(sorted(p.name for p in found.folder.iterdir() if p.is_dir()))}")
     print_text(recording.terms)
     camera = f" --camera {recording.camera}" if recording.camera else ""
     print_command(f"splatbot map {shlex.quote(str(found.log))}{camera}")

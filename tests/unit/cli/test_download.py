@@ -17,7 +17,7 @@ from splatbot.downloads import catalogue
 from splatbot.logs import open_log
 from tests.terminal import at_a_terminal
 from tests.unit.cli.conftest import RunCommand, assert_fix_named
-from tests.unit.downloads.server import FileServer, refuse, send, serving, tgz
+from tests.unit.downloads.server import FileServer, refuse, send, serving, tgz, zipped
 
 NAME = "tum/fr1_rpy"  # an entry without digest, which takes any archive
 PATH = "/rgbd/dataset/freiburg1/rgbd_dataset_freiburg1_rpy.tgz"
@@ -64,6 +64,16 @@ def test_a_complete_folder_is_reported(run: RunCommand, server: FileServer, tmp_
     assert "complete since an earlier download" in answer.out
     assert f"next: splatbot map '{folder}' --camera tum_fr1" in answer.out
     assert len(server.requests) == 1
+
+
+def test_an_archive_of_several_recordings_names_them(run: RunCommand, server: FileServer, tmp_path: Path) -> None:
+    server.add(
+        "/nice-slam/data/Replica.zip", zipped({f"Replica/{name}/traj.txt": b"" for name in ("room0", "office0")})
+    )
+    answer = run("download", "replica/nice-slam", "--out", tmp_path / "a")
+    assert answer.code == 0, answer.err
+    assert "recordings in it: office0, room0" in answer.out
+    assert answer.out.splitlines()[-1] == f"next: splatbot map {tmp_path / 'a' / 'office0'}"
 
 
 def test_a_quiet_download_prints_nothing(run: RunCommand, server: FileServer, tmp_path: Path) -> None:
