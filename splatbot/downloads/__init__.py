@@ -97,6 +97,8 @@ def download(
         ArchiveError: the archive is not the expected one, or is damaged; it is removed.
         OSError: the disk is full or not available.
     """
+    if folder.name in ("", ".."):
+        raise InputError("has no name of its own.", file=folder, field="--out", hint="name a new folder")
     folder.parent.mkdir(parents=True, exist_ok=True)
     pin = _pin(folder)
     with _working_folder(folder) as work:

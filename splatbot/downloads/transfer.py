@@ -225,7 +225,7 @@ def _check_status(response: httpx.Response) -> None:
     status = response.status_code
     if status in (200, 206, 416):
         return
-    answer = f"the server answers {status} {response.reason_phrase}".strip()
+    answer = f"the server answers {status} {httpx.codes.get_reason_phrase(status)}".strip()
     if status in _PASSING:
         wait = response.headers.get("Retry-After", "")
         raise _PassingError(answer, float(wait) if re.fullmatch(r"\d{1,6}", wait) else 0.0)

@@ -98,6 +98,12 @@ def test_other_folders_are_not_touched(
     assert server.requests == []
 
 
+@pytest.mark.parametrize("place", [".", "..", "/", "a/.."])
+def test_a_folder_without_a_name_is_refused(recording: PublicRecording, place: str) -> None:
+    with pytest.raises(InputError, match="name a new folder"):
+        get(recording, Path(place))
+
+
 def test_an_archive_of_known_digest_is_checked_and_not_pinned(
     server: FileServer, recording: PublicRecording, folder: Path
 ) -> None:
