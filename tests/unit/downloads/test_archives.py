@@ -145,6 +145,7 @@ def test_links_and_encrypted_members_of_a_zip_are_refused(tmp_path: Path) -> Non
         zipped({"a": b"1", "a/b": b"2"}),
         zipped({"a" * 300: b"1"}),
     ],
+    ids=["twice", "below a file", "above a file", "long", "empty", "dot", "zip below a file", "zip long"],
 )
 def test_names_that_no_folder_can_hold_are_refused(tmp_path: Path, archive: bytes) -> None:
     with pytest.raises(ArchiveError, match="impossible name"):
