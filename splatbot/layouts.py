@@ -7,7 +7,7 @@ from typing import Literal
 
 from splatbot.errors import FormatError, LogError
 
-LogKind = Literal["synthetic", "bag", "tum", "replica"]
+LogKind = Literal["synthetic", "bag", "tum", "replica", "7scenes", "images", "transforms", "scannet", "record3d"]
 
 MAP_NAME = "map.ply"
 TRAINING_NAME = "training.json"
@@ -16,10 +16,11 @@ MAP_SUFFIXES = (".ply", ".splat", ".spz", ".sog", ".glb")
 
 _SOG_NAME = "meta.json"  # of a map in a folder of WebP images
 _LAYOUTS_HINT = (
-    "known layouts: rgb.txt with depth.txt (TUM), results/ with traj.txt (Replica), metadata.yaml (ROS 2), "
-    "a .mcap or .bag file; "
-    "`synthetic:tabletop` needs no files"
+    "known folders: rgb.txt with depth.txt (TUM), results/ with traj.txt (Replica), metadata.yaml (ROS 2), 7-Scenes, "
+    "color/ with depth/ (Open3D, ScanNet). Known files: .mcap, .bag, .sens, .r3d; `synthetic:tabletop` needs no files"
 )
+_FILES: dict[str, LogKind] = {".mcap": "bag", ".bag": "bag", ".sens": "scannet", ".r3d": "record3d"}
+_TRANSFORMS_HEAD = 2**20  # bytes of transforms.json that hold its first frames
 _AS_TUM = "write rgb/, depth/ (16-bit PNG), rgb.txt, depth.txt and intrinsics.json (docs/guide/mapping.md)"
 _FROM_A_LOG = f"map a recording; splatbot reads files of Gaussians ({', '.join(MAP_SUFFIXES)})"
 _AS_PLY = "open it in https://superspl.at/editor and export it as PLY"
@@ -45,8 +46,6 @@ _FOREIGN_LOGS = {
     ".svo": ("a ZED recording", f"export it with ZED_SVO_Export of the ZED SDK, then {_AS_TUM}"),
     ".svo2": ("a ZED recording", f"export it with ZED_SVO_Export of the ZED SDK, then {_AS_TUM}"),
     ".klg": ("an ElasticFusion recording", f"extract its frames, then {_AS_TUM}"),
-    ".sens": ("a ScanNet recording", f"extract it with ScanNet's SensReader, then {_AS_TUM}"),
-    ".r3d": ("a Record3D recording", f"export it in Record3D as EXR and RGB, then {_AS_TUM}"),
     ".rrd": ("a Rerun recording", f"export its images with the Rerun SDK, then {_AS_TUM}"),
     **dict.fromkeys((".mp4", ".mov", ".avi"), ("a video without depth", "record colour and depth of an RGB-D camera")),
     **dict.fromkeys(
@@ -75,23 +74,43 @@ def log_kind(uri: str | Path) -> LogKind:
     text = str(uri)
     if text.startswith("synthetic:"):
         return "synthetic"
-    bag = Path(text.partition("?")[0])
-    if bag.suffix in (".mcap", ".bag") or (bag.is_dir() and (bag / "metadata.yaml").exists()):
-        if not bag.exists():
-            raise LogError("does not exist.", file=bag, field="log", hint="check the path")
+    place = Path(text)
+    bag = Path(text.partition("?")[0])  # topics follow the path of a bag
+    kind = _kind(place if place.exists() else bag)
+    if kind is not None and (kind == "bag" or place.exists()):
+        return kind
+    if not place.exists():
+        raise LogError("does not exist.", file=place, field="log", hint=f"check the path; {_LAYOUTS_HINT}")
+    if not place.is_dir():
+        what, hint = _foreign(place, _FOREIGN_LOGS) or ("a file of no known kind", f"check the path; {_LAYOUTS_HINT}")
+        raise LogError(f"is {what}.", file=place, field="log", hint=hint)
+    what, hint = _foreign_folder(place)
+    raise LogError(f"{what}.", file=place, field="log", hint=hint)
+
+
+def _kind(path: Path) -> LogKind | None:
+    """Return the kind of the recording at a path by its names, or None."""
+    if not path.is_dir():
+        return _FILES.get(path.suffix.lower()) if path.exists() else None
+    if (path / "metadata.yaml").exists():
         return "bag"
-    folder = Path(uri)
-    if not folder.exists():
-        raise LogError("does not exist.", file=folder, field="log", hint=f"check the path; {_LAYOUTS_HINT}")
-    if not folder.is_dir():
-        what, hint = _foreign(folder, _FOREIGN_LOGS) or ("a file of no known kind", f"check the path; {_LAYOUTS_HINT}")
-        raise LogError(f"is {what}.", file=folder, field="log", hint=hint)
-    if any((folder / name).exists() for name in ("rgb.txt", "depth.txt")):
+    if any((path / name).exists() for name in ("rgb.txt", "depth.txt")):
         return "tum"
-    if (folder / "results").is_dir() and (folder / "traj.txt").exists():
+    if (path / "results").is_dir() and (path / "traj.txt").exists():
         return "replica"
-    what, hint = _foreign_folder(folder)
-    raise LogError(f"{what}.", file=folder, field="log", hint=hint)
+    if any(path.glob("frame-*.color.png")):
+        return "7scenes"
+    if (path / "color").is_dir() and (path / "depth").is_dir():
+        return "images"
+    return "transforms" if _has_depth(path / "transforms.json") else None
+
+
+def _has_depth(transforms: Path) -> bool:
+    """Return whether the frames of a Nerfstudio scene name depth images."""
+    if not transforms.is_file():
+        return False
+    with transforms.open("rb") as file:
+        return b'"depth_file_path"' in file.read(_TRANSFORMS_HEAD)
 
 
 def map_file(path: str | Path) -> Path:
@@ -150,10 +169,6 @@ def _foreign_folder(folder: Path) -> tuple[str, str]:
         )
     if any((folder / name).exists() for name in ("sparse", "database.db", "cameras.bin", "cameras.txt")):
         return "is a COLMAP scene, which has no depth", f"train a map from its images: splatbot train {folder}"
-    if any(folder.glob("*.color.*")) or any(folder.glob("frame-*.depth.*")):
-        return "is a 7-Scenes sequence", f"rename its images: {_AS_TUM}"
-    if (folder / "color").is_dir() and (folder / "depth").is_dir():
-        return "is an Open3D or ScanNet export", f"list its images: {_AS_TUM}"
     if any(folder.glob("*.db3")) or any(folder.glob("*.mcap")):
         return "holds a rosbag2 without metadata.yaml", "run `ros2 bag reindex`, or name the .mcap file itself"
     inside = sorted(path.name for path in folder.iterdir() if log_layout(path)) if folder.is_dir() else []
@@ -164,9 +179,7 @@ def _foreign_folder(folder: Path) -> tuple[str, str]:
 
 def log_layout(path: Path) -> bool:
     """Return whether a path has the names of a log in one of the supported layouts."""
-    if path.suffix in (".mcap", ".bag") or (path / "metadata.yaml").exists() or (path / "rgb.txt").exists():
-        return True
-    return (path / "results").is_dir() and (path / "traj.txt").exists()
+    return _kind(path) is not None
 
 
 def _map_hint(folder: Path) -> str:

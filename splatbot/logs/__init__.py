@@ -2,29 +2,46 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 from splatbot.errors import LogError
-from splatbot.layouts import log_kind
+from splatbot.layouts import LogKind, log_kind
 from splatbot.logs.base import Log
 from splatbot.logs.calibration import Calibration
+from splatbot.logs.image_folder import ImageFolderLog
 from splatbot.logs.record import record
 from splatbot.logs.replica import ReplicaLog
+from splatbot.logs.seven_scenes import SevenScenesLog
 from splatbot.logs.tum import Missing, TumLog
 
 __all__ = ["Calibration", "Log", "open_log", "record"]
 
+_FOLDERS: dict[LogKind, Callable[..., Log]] = {
+    "replica": ReplicaLog,
+    "7scenes": SevenScenesLog,
+    "images": ImageFolderLog,
+}
 
-def open_log(uri: str | Path, *, camera: str | Path | Calibration | None = None, missing: Missing = "auto") -> Log:
+
+def open_log(
+    uri: str | Path,
+    *,
+    camera: str | Path | Calibration | None = None,
+    missing: Missing = "auto",
+    joint_delay: float = 0.0,
+) -> Log:
     """Open the log that ``uri`` names; frames are decoded only when read.
 
     Args:
-        uri: a folder in TUM or Replica layout, or a recording of ROS topics (`.mcap`, rosbag2 folder, `.bag`). Select
-            one of several cameras by `FILE?color=TOPIC&depth=TOPIC&info=TOPIC`. Generated logs have the form
+        uri: a folder in TUM, Replica, 7-Scenes, Open3D, ScanNet or Nerfstudio layout, or a `.sens` or `.r3d` file. A
+            recording of ROS topics is an `.mcap`, a rosbag2 folder or a `.bag`. Select one of several cameras by
+            `FILE?color=TOPIC&depth=TOPIC&info=TOPIC`. Generated logs have the form
             `synthetic:SCENE?trajectory=NAME&frames=N&effects=SPEC;SPEC&...` with the keys of
             :class:`splatbot.logs.synthetic.SyntheticOptions`.
         camera: a preset (tum_fr1, tum_fr2, tum_fr3), an `intrinsics.json` or a calibration that replaces the log's own.
         missing: treatment of colour images without depth in a TUM log, see :class:`splatbot.logs.tum.TumLog`.
+        joint_delay: time [s] by which the stamps of recorded joint positions are later than their motion.
 
     Raises:
         LogError: the log does not exist, has an unknown layout, or is damaged.
@@ -34,10 +51,10 @@ def open_log(uri: str | Path, *, camera: str | Path | Calibration | None = None,
     if kind == "synthetic":
         return _open_synthetic(str(uri), camera)
     if kind == "bag":
-        return _open_bag(str(uri), camera)
+        return _open_bag(str(uri), camera, joint_delay)
     if kind == "tum":
-        return TumLog(Path(uri), camera=camera, missing=missing)
-    return ReplicaLog(Path(uri), camera=camera)
+        return TumLog(Path(uri), camera=camera, missing=missing, joint_delay=joint_delay)
+    return _FOLDERS[kind](Path(uri), camera=camera)
 
 
 def _open_synthetic(uri: str, camera: str | Path | Calibration | None) -> Log:
@@ -48,8 +65,8 @@ def _open_synthetic(uri: str, camera: str | Path | Calibration | None) -> Log:
     return SyntheticLog(uri)
 
 
-def _open_bag(uri: str, camera: str | Path | Calibration | None) -> Log:
+def _open_bag(uri: str, camera: str | Path | Calibration | None, joint_delay: float) -> Log:
     from splatbot.logs.bag import BagLog, split_query  # rosbags builds its message classes when imported
 
     path, topics = split_query(uri)
-    return BagLog(path, camera=camera, topics=topics)
+    return BagLog(path, camera=camera, topics=topics, joint_delay=joint_delay)

@@ -14,7 +14,7 @@ from splatbot.errors import LogError
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8"
-_AGAIN = "copy or record the image again, or remove its line from the list"
+_AGAIN = "copy or record the image again, or remove it from the log"
 
 
 def read_color(path: Path) -> NDArray[np.uint8]:
@@ -23,11 +23,20 @@ def read_color(path: Path) -> NDArray[np.uint8]:
     Raises:
         LogError: the file is missing, truncated or corrupt.
     """
-    image = _decode(path, "colour", cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    return decode_color(_read(path, "colour"), path)
+
+
+def decode_color(data: bytes, source: Path) -> NDArray[np.uint8]:
+    """Decode the RGB image (H, W, 3) of a PNG or JPEG; ``source`` names it in errors.
+
+    Raises:
+        LogError: the image is truncated or corrupt.
+    """
+    image = _decode(data, source, "colour", cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
 
-def read_depth(path: Path, units_per_metre: float, *, empty: bool = False) -> NDArray[np.float32]:
+def read_depth(path: Path, units_per_metre: float, *, empty: bool = False, void: int = 0) -> NDArray[np.float32]:
     """Read depth (H, W) [m], 0 where missing, from a 16-bit PNG in units or a 32-bit float TIFF in metres.
 
     Raises:
@@ -35,16 +44,34 @@ def read_depth(path: Path, units_per_metre: float, *, empty: bool = False) -> ND
     """
     hint = "write one channel: 16-bit PNG (units of depth_scale) or 32-bit float TIFF (metres)"
     image = _one_channel(path, "depth", (np.uint16, np.float32), hint)
+    return depth_in_metres(image, units_per_metre, path, empty=empty, void=void)
+
+
+def depth_in_metres(
+    image: NDArray[Any], units_per_metre: float, source: Path, *, empty: bool = False, void: int = 0
+) -> NDArray[np.float32]:
+    """Return depth (H, W) [m], 0 where missing, of an image (H, W) of uint16 in units or of float32 in metres.
+
+    Args:
+        image: the recorded depth.
+        units_per_metre: unit of integers.
+        source: name of the image in errors.
+        empty: accept images without a valid pixel.
+        void: integer that, like 0, marks missing depth.
+
+    Raises:
+        LogError: no pixel has depth, unless ``empty``.
+    """
     if image.dtype == np.uint16:
-        depth = image.astype(np.float32) / np.float32(units_per_metre)
+        depth = np.where(image == void, 0, image).astype(np.float32) / np.float32(units_per_metre)
     else:
         depth = np.nan_to_num(image, nan=0.0, posinf=0.0, neginf=0.0)
     if not (empty or depth.any()):
         raise LogError(
             "has no valid depth: every pixel is 0 or NaN.",
-            file=path,
+            file=source,
             field="depth",
-            hint="remove the frame from rgb.txt and depth.txt, or check the output of the sensor",
+            hint="remove the frame from the log, or check the output of the sensor",
         )
     return depth
 
@@ -61,20 +88,23 @@ def read_mask(path: Path) -> NDArray[np.bool_]:
 
 def _one_channel(path: Path, field: str, types: tuple[type[np.generic], ...], hint: str) -> NDArray[Any]:
     """Decode an image (H, W) of one of the pixel types."""
-    image = _decode(path, field, cv2.IMREAD_UNCHANGED)
+    image = _decode(_read(path, field), path, field, cv2.IMREAD_UNCHANGED)
     if image.ndim != 2 or image.dtype not in types:
         channels = 1 if image.ndim == 2 else image.shape[2]
         raise LogError(f"has {channels} channel(s) of {image.dtype}.", file=path, field=field, hint=hint)
     return image
 
 
-def _decode(path: Path, field: str, flags: int) -> NDArray[Any]:
+def _read(path: Path, field: str) -> bytes:
     try:
-        data = path.read_bytes()
+        return path.read_bytes()
     except (OSError, ValueError) as error:  # ValueError: a path with a zero byte
         raise LogError(
             f"cannot be read ({getattr(error, 'strerror', error)}).", file=path, field=field, hint=_AGAIN
         ) from error
+
+
+def _decode(data: bytes, path: Path, field: str, flags: int) -> NDArray[Any]:
     damage = _damage(data)
     if damage:
         raise LogError(f"{damage}.", file=path, field=field, hint=_AGAIN)

@@ -60,6 +60,23 @@ class RgbdReader:
         """
         rgb = read_color(color)
         z = read_depth(depth, self.calibration.depth_scale, empty=self._empty_depth)
+        return self.frame(index, stamp, rgb, z, color, depth, mask)
+
+    def frame(
+        self,
+        index: int,
+        stamp: float,
+        rgb: NDArray[np.uint8],
+        z: NDArray[np.float32],
+        color: Path,
+        depth: Path,
+        mask: NDArray[np.bool_] | None = None,
+    ) -> Frame:
+        """Build a frame of decoded images; ``color`` and ``depth`` name their files in errors.
+
+        Raises:
+            LogError: sizes differ, or (frame 0) the unit of depth is implausible.
+        """
         self._check_sizes(rgb, z, color, depth)
         if mask is not None and mask.shape != z.shape:
             raise LogError(
@@ -110,19 +127,10 @@ class RgbdReader:
         )
 
 
-class FolderLog(LogBase):
-    """The common part of logs whose images lie in a folder; ``_reader`` reads them.
-
-    Args:
-        folder: of the log.
-    """
+class ReaderLog(LogBase):
+    """The common part of logs whose frames ``_reader`` builds."""
 
     _reader: RgbdReader
-
-    def __init__(self, folder: str | Path) -> None:
-        self.folder = Path(folder)
-        self.uri = str(folder)
-        self.name = self.folder.resolve().name
 
     @property
     def camera(self) -> Camera:
@@ -133,3 +141,16 @@ class FolderLog(LogBase):
     def calibration(self) -> Calibration:
         """Calibration of the recorded images."""
         return self._reader.calibration
+
+
+class FolderLog(ReaderLog):
+    """The common part of logs whose images lie in a folder.
+
+    Args:
+        folder: of the log.
+    """
+
+    def __init__(self, folder: str | Path) -> None:
+        self.folder = Path(folder)
+        self.uri = str(folder)
+        self.name = self.folder.resolve().name

@@ -83,12 +83,11 @@ def make_names(tmp_path: Path) -> dict[str, str]:
         ("a.mkv", "Azure Kinect", "AzureKinectMKVReader"),
         ("a.svo", "ZED", "ZED_SVO_Export"),
         ("a.klg", "ElasticFusion", "16-bit PNG"),
-        ("a.sens", "ScanNet", "SensReader"),
         ("a.oni", "OpenNI", "OpenNI2"),
         ("a.db3", "rosbag2", "metadata.yaml"),
         ("a.mp4", "without depth", "RGB-D"),
         ("a.ply", "map or a point cloud", "splatbot info"),
-        ("a.xyz", "no known kind", "known layouts"),
+        ("a.xyz", "no known kind", "known folders"),
     ],
 )
 def test_a_file_that_is_no_log_is_named_with_the_way_to_convert_it(
@@ -105,7 +104,6 @@ def test_a_file_that_is_no_log_is_named_with_the_way_to_convert_it(
     [
         ("transforms.json", "Nerfstudio"),
         ("sparse/0/", "COLMAP"),
-        ("frame-000000.color.png", "7-Scenes"),
         ("a_0.mcap", "rosbag2 without metadata"),
         ("map.ply", "folder of a run"),
         ("desk/rgb.txt", "desk"),
@@ -121,6 +119,33 @@ def test_a_folder_that_is_no_log_is_named(tmp_path: Path, inside: str, what: str
     with pytest.raises(LogError) as refused:
         log_kind(tmp_path)
     assert what in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("inside", "kind"),
+    [
+        ("rgb.txt", "tum"),
+        ("frame-000000.color.png", "7scenes"),
+        ("color/0.jpg depth/0.png", "images"),
+        ('transforms.json:{"frames": [{"depth_file_path": "d"}]}', "transforms"),
+        ("results/frame000000.jpg traj.txt", "replica"),
+        ("metadata.yaml", "bag"),
+    ],
+)
+def test_a_folder_is_recognized_by_its_names(tmp_path: Path, inside: str, kind: str) -> None:
+    name, _, content = inside.partition(":")
+    for place in map(tmp_path.joinpath, name.split()):
+        place.parent.mkdir(exist_ok=True)
+        place.write_text(content)
+    assert log_kind(tmp_path) == kind
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"), [("a.sens", "scannet"), ("A.R3D", "record3d"), ("a.mcap", "bag"), ("a.bag?color=/c", "bag")]
+)
+def test_a_file_is_recognized_by_its_suffix(tmp_path: Path, name: str, kind: str) -> None:
+    (tmp_path / name.partition("?")[0]).touch()
+    assert log_kind(tmp_path / name) == kind
 
 
 @pytest.mark.parametrize(
