@@ -64,6 +64,7 @@ class Runtime:
         self.config = config or Config()
         self.robot = None if settings.robot is None else known_robot(settings.robot)
         self.workspace = None if settings.scene is None else Workspace.load(settings.scene)
+        self._mask_of_topics = None if self.workspace is None else self.new_mask(self.workspace)
         self.library = MapLibrary(settings.data_dir) if settings.data_dir is not None else None
         if self.library is not None:
             self.library.lock()
@@ -161,7 +162,9 @@ class Runtime:
             InputError: the frame does not fit those before, or the map is made of something else.
         """
         with suppress(MapExistsError):
-            self.open_stream(map_id, workspace=self.workspace, mask=self.new_mask(self.workspace))
+            mask = self._mask_of_topics or self.new_mask(self.workspace)
+            self.open_stream(map_id, workspace=self.workspace, mask=mask)
+            self._mask_of_topics = self.new_mask(self.workspace)  # of the next map of that name
         self.stream(map_id).push(frame)
 
     def new_mask(self, workspace: Workspace | None) -> RobotMask | None:
@@ -176,14 +179,13 @@ class Runtime:
         """Publish a robot's joints, and keep them for the frames of each map in which it is masked.
 
         Returns:
-            The number of maps that keep them.
+            The number of masks that keep them: those of maps, and that of the next map of ROS topics.
 
         Raises:
             InputError: the state lacks a joint of such a map's robot, or a value is not finite.
         """
-        masks = [served.mask for served in self.store.list() if served.mask is not None]
-        masks = [mask for mask in masks if mask.robot.name == robot]
-        kept = sum(mask.history.add(state) for mask in masks)
+        masks = [self._mask_of_topics, *(served.mask for served in self.store.list())]
+        kept = sum(mask.history.add(state) for mask in masks if mask is not None and mask.robot.name == robot)
         self.bus.publish(robot_topic(robot, JOINTS), state)
         return kept
 

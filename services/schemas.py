@@ -139,7 +139,7 @@ class RobotInView(Request):
 class JointStatesTaken(BaseModel):
     """Use of reported joint states."""
 
-    maps: int = Field(description="maps in which the robot is masked by them")
+    masks: int = Field(description="masks of maps that use them; 0: the robot is masked in no map")
 
 
 class RobotMaskInfo(BaseModel):

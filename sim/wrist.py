@@ -31,14 +31,15 @@ T_PANDA_CAMERA = np.array(
 
 
 class WristLog(LogBase):
-    """Simulated frames with joints from a camera on the last link of a moving arm.
+    """Simulated frames with joints from a camera on a link of a moving arm.
 
     Args:
         robot: rendered as its capsules.
         joints: (F, J) of each frame.
         surfaces: of the scene, in its own frame.
         T_scene_base: (4, 4) pose of the arm's base in the scene.
-        T_link_camera: (4, 4), the camera on the last link.
+        T_link_camera: (4, 4), the camera on its link.
+        link: index of the link that carries the camera; -1 is the last one, 0 the base.
         width: [px].
         rate: of the frames [Hz].
         moving: moving objects in the scene, by name.
@@ -52,6 +53,7 @@ class WristLog(LogBase):
         *,
         T_scene_base: Array,
         T_link_camera: Array = T_PANDA_CAMERA,
+        link: int = -1,
         width: int = 320,
         rate: float = 30.0,
         moving: Mapping[str, Moving] | None = None,
@@ -62,7 +64,7 @@ class WristLog(LogBase):
         self.robot, self.joints, self.T_scene_base = robot, joints, T_scene_base
         T = T_scene_base @ robot.fk(joints)
         stamps = np.arange(len(joints)) / rate
-        self.ground_truth = Trajectory(stamps, T[:, -1] @ T_link_camera)
+        self.ground_truth = Trajectory(stamps, T[:, link] @ T_link_camera)
         links = {f"link {k}": Moving(found, _pose_of(stamps, T[:, k])) for k, found in _link_surfaces(robot).items()}
         self.scene = RaycastScene(surfaces, links | dict(moving or {}))
 

@@ -171,7 +171,7 @@ class Client(AbstractContextManager["Client"]):
             map_id: name of the map.
             log: synthetic:SCENE?..., or a folder under the service's log roots.
             key: Idempotency-Key; a repeated request with the same key returns the same job.
-            more: camera, max_frames, robot_base.
+            more: camera, max_frames, robot_base, robot.
         """
         body = {"id": map_id, **({"log": log} if log is not None else {}), **more}
         return self._json("POST", "/v1/maps", body, _idempotency(key))
@@ -188,10 +188,31 @@ class Client(AbstractContextManager["Client"]):
             "camera": {n: getattr(c, n) for n in ("fx", "fy", "cx", "cy", "width", "height")},
             "rgb": frame.rgb,
             "depth": frame.depth,
+            "mask": frame.mask,
+            "depth_delay": frame.depth_delay,
             "joints": None if frame.joints is None else frame.joints.tolist(),
+            "joint_names": list(frame.joint_names),
         }
         answer = self._packed("POST", _map_path(map_id, "frames"), body)
         return _result(TrackedFrame, answer)
+
+    def report_joints(self, robot: str, stamps: ArrayLike, positions: ArrayLike, *, names: Sequence[str] = ()) -> int:
+        """Report joint states, by which a robot is masked in the frames of maps; return the number of masks that use them.
+
+        Args:
+            robot: its name.
+            stamps: (N,) by the clock of the images [s], at most 1000.
+            positions: (N, J) [rad or m].
+            names: of the joints; if empty, they are in the order of the robot.
+        """
+        rows = zip(np.asarray(stamps, np.float64).tolist(), np.asarray(positions, np.float64).tolist(), strict=True)
+        states = [{"stamp": stamp, "position": q, "names": list(names)} for stamp, q in rows]
+        return int(self._json("POST", f"/v1/robots/{quote(robot, safe='')}/joints", {"states": states})["masks"])
+
+    def hold(self, map_id: str, spheres: ArrayLike) -> None:
+        """Mask an object in the robot's hand: spheres (A, 4) (x, y, z, radius) [m] in the frame of the last link."""
+        body = {"spheres": np.asarray(spheres, np.float64).reshape(-1, 4).tolist()}
+        self.request("PUT", _map_path(map_id, "held"), json.dumps(body).encode(), {"Content-Type": "application/json"})
 
     def resync(self, map_id: str) -> None:
         """Announce that the clock of the frames was set; the next frame may have any stamp."""

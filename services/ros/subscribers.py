@@ -15,6 +15,7 @@ from splatbot.logs.index import MAX_STAMP_DIFFERENCE_S
 from splatbot.logs.mcap import COLOR, DEPTH, INFO, JOINTS
 from splatbot.logs.ros_frames import camera_of, color_of, depth_of, seconds_of, size_of
 from splatbot.logs.undistort import Undistorter
+from splatbot.services.bus import Subscription
 from splatbot.services.problems import BusyError, TooLargeError
 from splatbot.services.ros.graph import RosGraph
 from splatbot.services.ros.messages import joints_of
@@ -25,12 +26,13 @@ from splatbot.services.topics import JointState
 
 MAX_PIXELS = 2_100_000  # of an image, unless the settings of the service say otherwise
 _WAITING = 16
+_WAITING_STATES = 2000  # 2 s of a robot at 1 kHz, while an image is decoded
 
 _log = logging.getLogger(__name__)
 
 
 class RosSubscribers:
-    """A thread that builds frames from clients' images and takes their joint states.
+    """Two threads: one builds frames from clients' images, the other takes joint states, which come more often.
 
     A frame is a colour image, the depth image nearest in time (within 0.02 s) and the latest CameraInfo. Unusable
     messages are logged, which also reaches /rosout.
@@ -53,20 +55,28 @@ class RosSubscribers:
         self._on_joints, self._on_frame = on_joints, on_frame
         self.dropped = 0
         self._pairs = FramePairs(max_pixels)
-        self._news = graph.subscribe(COLOR, DEPTH, INFO, JOINTS, capacity=_WAITING)
-        self._thread = threading.Thread(target=self._run, name="ros-inlets", daemon=True)
+        self._news = (
+            graph.subscribe(COLOR, DEPTH, INFO, capacity=_WAITING),
+            graph.subscribe(JOINTS, capacity=_WAITING_STATES),
+        )
+        self._threads = [
+            threading.Thread(target=self._run, args=(news,), name=f"ros-{name}", daemon=True)
+            for news, name in zip(self._news, ("images", "joints"), strict=True)
+        ]
 
     def start(self) -> None:
         """Begin."""
-        self._thread.start()
+        for thread in self._threads:
+            thread.start()
 
     def stop(self, timeout_s: float = 5.0) -> None:
         """End."""
-        self._news.close()
-        join_started([self._thread], timeout_s)
-
-    def _run(self) -> None:
         for news in self._news:
+            news.close()
+        join_started(self._threads, timeout_s)
+
+    def _run(self, subscription: Subscription) -> None:
+        for news in subscription:
             value: RosMessage = news.value
             if value.client == 0:
                 continue

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from fastapi import APIRouter, Depends, Request, Response
 from numpy.typing import NDArray
-from pydantic import Field, field_validator
+from pydantic import Field, ValidationInfo, field_validator
 
 from splatbot.camera import Camera
 from splatbot.errors import InputError
@@ -20,7 +20,7 @@ from splatbot.services.codecs import answer, answers, body_of, request_body
 from splatbot.services.dependencies import Served, Service, problems
 from splatbot.services.problems import BusyError, TooLargeError
 from splatbot.services.recordings import checked_image
-from splatbot.services.schemas import CameraIn
+from splatbot.services.schemas import MAX_JOINTS, CameraIn
 from splatbot.services.schemas import Request as Body
 
 router = APIRouter(prefix="/v1/maps", tags=["frames"])
@@ -40,11 +40,20 @@ class FrameRequest(Body):
     rgb: Any = Field(description="PNG or JPEG, or array")
     depth: Any = Field(description="16-bit PNG, or array; 0 where it is not known")
     depth_scale: float = Field(1000.0, gt=0, allow_inf_nan=False, description="units per metre of an integer depth")
-    joints: list[float] | None = Field(None, description="the robot's joints [rad or m] at `stamp`")
+    mask: Any = Field(None, description="PNG or bool array; a pixel that is 0 is neither tracked nor mapped")
+    depth_delay: float = Field(0.0, ge=-1.0, le=1.0, description="time by which depth is later than `stamp` [s]")
+    joints: list[float] | None = Field(
+        None, max_length=MAX_JOINTS, description="the robot's joints [rad or m] at `stamp`"
+    )
+    joint_names: list[str] = Field(
+        [], max_length=MAX_JOINTS, description="of `joints`; if empty, they are in the robot's order"
+    )
 
-    @field_validator("rgb", "depth", mode="before")
+    @field_validator("rgb", "depth", "mask", mode="before")
     @classmethod
-    def _image(cls, value: Any) -> Any:
+    def _image(cls, value: Any, info: ValidationInfo) -> Any:
+        if value is None and info.field_name == "mask":
+            return None
         if isinstance(value, str):
             try:
                 return base64.b64decode(value, validate=True)
@@ -141,8 +150,19 @@ def _frame(query: FrameRequest, max_pixels: int) -> Frame:
     joints = None if query.joints is None else np.array(query.joints, dtype=np.float64)
     if joints is not None and not np.isfinite(joints).all():
         raise InputError("has values that are not finite.", field="joints", hint="give radians and metres")
+    mask = None if query.mask is None else _decoded(query.mask, "mask", cv2.IMREAD_GRAYSCALE, max_pixels) > 0
     rgb, depth = np.ascontiguousarray(rgb), np.ascontiguousarray(depth)
-    return Frame(query.stamp, rgb, depth, camera, joints=joints, source="the pushed frame")
+    return Frame(
+        query.stamp,
+        rgb,
+        depth,
+        camera,
+        joints=joints,
+        joint_names=tuple(query.joint_names),
+        mask=mask,
+        depth_delay=query.depth_delay,
+        source="the pushed frame",
+    )
 
 
 def _decoded(value: Any, field: str, flags: int, max_pixels: int) -> NDArray[Any]:

@@ -25,7 +25,7 @@ class JointStateIn(Body):
 
     stamp: float = Field(allow_inf_nan=False, description="[s], by the clock of the images")
     position: list[float] = Field(min_length=1, max_length=MAX_JOINTS, description="[rad or m]")
-    names: list[str] = Field([], max_length=MAX_JOINTS, description="of the joints; none: in the robot's order")
+    names: list[str] = Field([], max_length=MAX_JOINTS, description="of the joints; if empty, in the robot's order")
 
 
 class JointStatesRequest(Body):
@@ -37,7 +37,7 @@ class JointStatesRequest(Body):
 class HeldRequest(Body):
     """Object in the robot's hand, as spheres in the frame of the last link."""
 
-    spheres: list[Vector4] = Field(max_length=MAX_HELD, description="x, y, z, radius [m]; none: the hand is empty")
+    spheres: list[Vector4] = Field(max_length=MAX_HELD, description="x, y, z, radius [m]; an empty list releases the object")
 
 
 class NoRobotError(InputError):
@@ -52,7 +52,7 @@ _HELD = {"spheres": [[0.0, 0.0, 0.12, 0.04]]}
 
 @router.post(
     "/v1/robots/{robot}/joints",
-    responses=example({"maps": 1}) | problems(413, 415, 422),
+    responses=example({"masks": 1}) | problems(413, 415, 422),
     openapi_extra=request_body(JointStatesRequest, {"one state": _STATES}),
 )
 def report_joints(
@@ -67,7 +67,7 @@ def report_joints(
             hint = "give one position for each name"
             raise InputError(f"has {len(state.position)} values.", field="position", hint=hint)
         kept = service.report_joints(name, JointState(state.stamp, tuple(state.names), np.array(state.position)))
-    return JointStatesTaken(maps=kept)
+    return JointStatesTaken(masks=kept)
 
 
 @router.put(

@@ -79,6 +79,11 @@ CALIBRATIONS = {
         "calibrate_hand_eye_command",
         "Estimate the camera's pose on an arm, joint offsets and the time offset, with a board or without.",
     ),
+    "joint-delay": _Command(
+        "splatbot.cli.calibrate_delay",
+        "calibrate_joint_delay_command",
+        "Estimate the delay of joint states from an arm that moves in view of a static camera.",
+    ),
 }
 
 _GROUPS = {

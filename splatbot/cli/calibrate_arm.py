@@ -347,4 +347,14 @@ def _completed(
         camera_link=link,
         joint_offsets=offsets if offsets.any() else None,
         T_world_base=inverse(found.T_base_static) if tracked else scene.T_world_base,
+        joint_delay=_joint_delay(found) if tracked and arm is not None else scene.joint_delay,
     )
+
+
+def _joint_delay(found: HandEyeCalibration) -> float:
+    """Return the delay [s] of joint states for masks; 0 if both recordings have one clock, or unrelated ones."""
+    from splatbot.workspace import MAX_JOINT_DELAY_S
+
+    delay = found.delay
+    known = delay is not None and not delay.refusal and abs(delay.value) <= MAX_JOINT_DELAY_S
+    return delay.value if known and delay is not None else 0.0

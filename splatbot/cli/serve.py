@@ -67,8 +67,8 @@ def serve(
         ros_port: additional port for roslib clients that need a separate one (usually 9090). rosbridge is always at
             /rosbridge of --port, Foxglove at /foxglove.
         viewer_port: show the map in the browser at this port, on this machine alone. The page needs a key.
-        robot: mask this robot in the frames of --log, of a camera and of ROS topics, by its joint states at the time of
-            each image, or SPLATBOT_ROBOT. A frame without them is not mapped.
+        robot: mask this robot in the frames of --log, of a camera and of ROS topics, or SPLATBOT_ROBOT. A frame without
+            joint states at its time is not mapped.
         scene: scene.yaml with T_link_camera, the camera on the robot's link, and joint_delay; by default that of the
             log's folder.
         record: record every topic into this MCAP file, from which the frames can be mapped again.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -115,13 +116,13 @@ class JointStates:
 def select_joints(names: Sequence[str], positions: NDArray[np.float64], wanted: Sequence[str]) -> NDArray[np.float64]:
     """Return the positions (J,) of the ``wanted`` joints, in their order.
 
-    Positions without names, or named joint1, joint2, ... as recordings without names are written, are in the order of
-    the robot already; those of a gripper may follow.
+    Positions without names are in the order of the robot already, and those of a gripper may follow. So are positions
+    whose names are consecutive numbers (joint1, joint2, ... or q0, q1, ...).
 
     Raises:
         InputError: a joint is missing.
     """
-    generic = not set(names) & set(wanted) and list(names) == [f"joint{k + 1}" for k in range(len(names))]
+    generic = not set(names) & set(wanted) and _are_numbers(names)
     if not len(names) or generic:
         if len(positions) < len(wanted):
             raise InputError(
@@ -137,6 +138,13 @@ def select_joints(names: Sequence[str], positions: NDArray[np.float64], wanted: 
             hint=f"its joints are {', '.join(names)}; list those of the robot as joint_names in scene.yaml",
         )
     return np.array([known[name] for name in wanted])
+
+
+def _are_numbers(names: Sequence[str]) -> bool:
+    """Return whether names are consecutive numbers from 0 or 1 after one of the usual words."""
+    found = [re.fullmatch(r"(q|j|joint)_?(\d+)", name) for name in names]
+    numbers = [int(match[2]) for match in found if match is not None]
+    return len(numbers) == len(names) > 0 and numbers in (list(range(len(names))), list(range(1, len(names) + 1)))
 
 
 def interpolate_joints(

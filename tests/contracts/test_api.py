@@ -60,7 +60,7 @@ def test_every_documented_example_is_answered_as_documented(api: Service) -> Non
     asked = 0
     for path, item in api.client.get("/openapi.json").json()["paths"].items():
         for name, example in _examples(item.get("post", {})).items():
-            where = path.replace("{map_id}", "default").replace("{name}", "twin")
+            where = path.replace("{map_id}", "default").replace("{name}", "twin").replace("{robot}", "panda")
             if where.endswith("/frames"):
                 api.client.post("/v1/maps", json={"id": "frames"})
                 where = "/v1/maps/frames/frames"

@@ -22,13 +22,11 @@ from splatbot.grasping.affordance import NameHint, find_target
 from splatbot.grasping.language import LanguageAffordance
 from splatbot.grasping.pick import Picker
 from splatbot.grasping.sampler import GraspSampler
-from splatbot.logs import open_log
 from splatbot.robots.controllers import FakeController
 from splatbot.robots.grippers import FakeGripper
 from splatbot.robots.panda import panda
 from splatbot.segmentation import segment
 from splatbot.serving import serving
-from splatbot.slam import Slam
 from tests.unit.grasping.objects import CAN, OBJECTS, colored
 
 ROOT = Path(__file__).parents[2]
@@ -67,11 +65,6 @@ def _grasping(desk: Path) -> Names:
     return {"snapshot": _table(), "T_world_base": np.eye(4), "panda": panda, "observers": None}
 
 
-def _mapping(desk: Path) -> Names:
-    frame = replace(open_log(LOG)[0], joints=panda().home)
-    return {"panda": panda, "T_link_camera": np.eye(4), "slam": Slam(), "frame": frame}
-
-
 def _picking(desk: Path) -> Names:
     controller = FakeController(panda().home)
     names = {
@@ -99,7 +92,6 @@ def _tracking(desk: Path) -> Names:
 CONTEXTS: dict[str, Callable[[Path], Names]] = {
     "docs/guide/formats.md": _formats,
     "docs/guide/grasping.md": _grasping,
-    "docs/guide/mapping.md": _mapping,
     "docs/guide/picking.md": _picking,
     "docs/guide/planning.md": _planning,
     "docs/guide/tracking.md": _tracking,
@@ -112,7 +104,7 @@ RESULTS: dict[str, Callable[[Names], bool]] = {
     "docs/guide/tracking.md": lambda names: names["result"].verdict == "ok" and names["frame"].prior is not None,
     "docs/guide/twin.md": lambda names: names["result"].steps > 1000,
 }
-OF_A_SERVICE = ["docs/guide/ros.md", "docs/guide/service.md"]
+OF_A_SERVICE = ["docs/guide/robot-in-view.md", "docs/guide/ros.md", "docs/guide/service.md"]
 
 
 @pytest.mark.parametrize("name", [name for name in WITH_SNIPPETS if name not in OF_A_SERVICE])

@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatbot.errors import LogError
+from splatbot.errors import InputError, LogError
 from splatbot.logs import open_log
-from splatbot.logs.joints import JointRecord
+from splatbot.logs.joints import JointRecord, JointStates, select_joints
+from splatbot.logs.mcap import record_mcap
 from splatbot.logs.record import record
 
 
@@ -55,3 +56,71 @@ def test_recorded_joints_are_read_with_their_frames(make_log: Callable[..., Path
         assert frame.joints is not None
         assert known.joints is not None
         np.testing.assert_array_equal(frame.joints, known.joints)
+
+
+def test_names_of_joints_survive_a_recording_and_give_the_robots_order(
+    make_log: Callable[..., Path], tmp_path: Path
+) -> None:
+    frames = [
+        replace(f, joints=np.array([0.3, 0.1 * k, 0.2]), joint_names=("finger", "b", "a"))
+        for k, f in enumerate(open_log(str(make_log(4))))
+    ]
+    frames[2] = replace(frames[2], joints=np.array([0.2, 0.2]), joint_names=("a", "b"))  # the finger was silent
+    folder = record(frames, tmp_path / "again")
+    assert JointRecord(folder / "joints.txt").names == ("finger", "b", "a")
+    np.testing.assert_allclose(
+        JointRecord(folder / "joints.txt").ordered(("a", "b")), [[0.2, 0.0], [0.2, 0.1], [0.2, 0.3]]
+    )
+    for log in (open_log(str(folder)), open_log(str(record_mcap(open_log(str(folder)), tmp_path / "a.mcap")))):
+        first = log[1]
+        assert first.joints is not None
+        np.testing.assert_allclose(select_joints(first.joint_names, first.joints, ("a", "b")), [0.2, 0.1], atol=1e-12)
+
+
+def test_a_delay_of_joint_states_is_taken_back_when_a_log_is_read(
+    make_log: Callable[..., Path], tmp_path: Path
+) -> None:
+    folder = make_log(4)
+    stamps = np.arange(-1.0, 2.0, 0.02) + open_log(str(folder))[0].stamp
+    (folder / "joints.txt").write_text("".join(f"{t!r} {t - 0.1!r}\n" for t in stamps.tolist()))
+    for frame in open_log(str(folder), joint_delay=0.1):
+        assert frame.joints is not None
+        assert frame.joints[0] == pytest.approx(frame.stamp, abs=1e-9)
+
+
+def test_the_joints_of_several_publishers_come_together_each_at_its_own_rate() -> None:
+    begin = 10.0
+    states = JointStates(
+        [(begin + 0.01 * k, ("b", "a"), np.array([-k, float(k)])) for k in range(20)]
+        + [(begin + 0.1 * k, ("finger",), np.array([0.04])) for k in range(2)]
+        + [(begin, ("a",), np.array([np.nan])), (begin, ("a", "b"), np.array([1.0])), (begin, (), np.zeros(0))]
+    )
+    names, q = states.at(begin + 0.055) or ((), np.zeros(0))
+    assert dict(zip(names, q.tolist(), strict=True)) == pytest.approx({"a": 5.5, "b": -5.5, "finger": 0.04})
+    names, q = states.at(begin + 0.28) or ((), np.zeros(0))  # the finger alone is within 0.1 s of no later state
+    assert set(names) == {"a", "b"}
+    assert states.at(begin + 1.0) is None
+    assert JointStates([]).at(begin) is None
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        ((), [1.0, 2.0]),
+        (("joint1", "joint2", "joint3"), [1.0, 2.0]),
+        (("q0", "q1", "q2"), [1.0, 2.0]),
+        (("b", "x", "a"), [3.0, 1.0]),
+        (("joint2", "joint1", "joint3"), None),
+        (("a", "x", "y"), None),
+        (("left_1", "left_2", "left_3"), None),
+    ],
+)
+def test_joints_are_selected_by_name_or_by_number_and_never_by_chance(
+    names: tuple[str, ...], expected: list[float] | None
+) -> None:
+    positions = np.array([1.0, 2.0, 3.0])
+    if expected is None:
+        with pytest.raises(InputError, match="has no joint"):
+            select_joints(names, positions, ("a", "b"))
+    else:
+        assert select_joints(names, positions, ("a", "b")).tolist() == expected

@@ -11,16 +11,13 @@ from splatbot.errors import InputError
 from splatbot.frame import Frame
 from splatbot.geometry import transform_points
 from splatbot.logs.scenes.tabletop import tabletop
-from splatbot.mapping.selfmask import SelfMask
-from splatbot.protocols import Array
+from splatbot.mapping.selfmask import JointsUnknownError, SelfMask
 from splatbot.robots.panda import panda
-from splatbot.robots.shapes import Capsule
 from splatbot.run.masked import MaskedLog
 from splatbot.sim.wrist import T_PANDA_CAMERA, WristLog
 from splatbot.slam import Slam
+from tests.swept_arm import START, T_BASE_STATIC_CAMERA, T_SCENE_BASE, distance_to_arm
 
-T_SCENE_BASE = np.array([[0.0, -1, 0, 0.0], [1, 0, 0, -0.55], [0, 0, 1, 0.0], [0, 0, 0, 1]])
-START = np.array([0.0, -0.35, 0.0, -2.1, 0.0, 1.9, np.pi / 4])
 SWING = np.array([0.25, 0.1, 0.0, 0.1, 0.0, 0.1, 0.2])
 
 
@@ -29,26 +26,6 @@ def log() -> WristLog:
     """The arm swings over the table, at least 10 cm from everything on it."""
     joints = START + np.sin(np.linspace(0, np.pi / 2, 24))[:, None] * SWING
     return WristLog(panda(), joints, tabletop().surfaces, T_scene_base=T_SCENE_BASE, width=160)
-
-
-def _distance_to_arm(points: Array, q: Array) -> Array:
-    """Compute the distances (P,) [m] of points (P, 3) in the base frame to the true capsules."""
-    robot = panda()
-    T = robot.fk(q)
-    shapes = [(T[s.link], np.array(s.start), np.array(s.end), s.radius) for s in robot.shapes if isinstance(s, Capsule)]
-    assert robot.gripper is not None
-    for T_finger in robot.gripper.T_link_finger:
-        for s in robot.gripper.shapes:
-            assert isinstance(s, Capsule)
-            open_ = np.array([0.0, robot.gripper.stroke, 0.0])
-            shapes.append((T[-1] @ T_finger, np.array(s.start) + open_, np.array(s.end) + open_, s.radius))
-    least = np.full(len(points), np.inf)
-    for pose, start, end, radius in shapes:
-        a, b = transform_points(pose, np.stack([start, end]))
-        along = b - a
-        share = np.clip((points - a) @ along / max(float(along @ along), 1e-12), 0, 1)
-        least = np.minimum(least, np.linalg.norm(points - a - share[:, None] * along, axis=1) - radius)
-    return least
 
 
 def test_the_hand_is_in_view_and_every_pixel_of_it_is_left_out(log: WristLog) -> None:
@@ -65,7 +42,7 @@ def test_the_hand_is_in_view_and_every_pixel_of_it_is_left_out(log: WristLog) ->
             T_PANDA_CAMERA, frame.camera.backproject(frame.depth)[usable & (frame.depth > 0)].astype(float)
         )
         at_base = transform_points(panda().fk(log.joints[index])[-1], points)
-        assert _distance_to_arm(at_base, log.joints[index]).min() > 0.02
+        assert distance_to_arm(at_base, log.joints[index]).min() > 0.02
 
 
 def test_with_the_mask_no_gaussian_is_near_the_swept_arm_and_without_it_many_are(log: WristLog) -> None:
@@ -78,7 +55,7 @@ def test_with_the_mask_no_gaussian_is_near_the_swept_arm_and_without_it_many_are
         model = slam.snapshot().model
         T_base_map = np.linalg.inv(T_SCENE_BASE) @ log.ground_truth.T_world_camera[0]
         means = transform_points(T_base_map, model.means.double().numpy())
-        swept = np.min([_distance_to_arm(means, q) for q in log.joints], axis=0)
+        swept = np.min([distance_to_arm(means, q) for q in log.joints], axis=0)
         near.append(int((swept < 0.02).sum()))
         arm = RobotSpheres(panda(), T_world_base=np.linalg.inv(T_base_map))
         field = GaussianCollisionField(slam.snapshot(), min_observations=0)
@@ -138,3 +115,41 @@ def test_frames_without_joints_and_cameras_on_no_link_are_refused() -> None:
         SelfMask(panda(), np.eye(4), link=8)
     with pytest.raises(InputError, match="rigid"):
         SelfMask(panda(), np.ones((4, 4)))
+
+
+def _front(z: float, q: np.ndarray, names: tuple[str, ...] = ()) -> Frame:
+    camera = Camera(100.0, 100.0, 79.5, 59.5, 160, 120)
+    rgb = np.zeros((120, 160, 3), np.uint8)
+    return Frame(0.0, rgb, np.full((120, 160), z, np.float32), camera, joints=q, joint_names=names)
+
+
+def test_joints_are_found_by_their_names_in_any_order_and_among_others() -> None:
+    mask = SelfMask(panda(), T_BASE_STATIC_CAMERA, link=0)
+    in_order = mask.usable(_front(3.0, START))
+    names = ("finger", *reversed(panda().chain.names))
+    shuffled = mask.usable(_front(3.0, np.array([0.02, *reversed(START)]), names))
+    np.testing.assert_array_equal(shuffled, in_order)
+    generic = tuple(f"joint{k + 1}" for k in range(8))
+    np.testing.assert_array_equal(mask.usable(_front(3.0, np.array([*START, 0.02]), generic)), in_order)
+    own = tuple(f"left_arm_{k}" for k in range(7))
+    with pytest.raises(JointsUnknownError, match=r"has no joint panda_joint1.*joint_names"):
+        mask.usable(_front(3.0, START, own))
+    renamed = SelfMask(panda(), T_BASE_STATIC_CAMERA, link=0, joint_names=own)
+    np.testing.assert_array_equal(renamed.usable(_front(3.0, START[::-1].copy(), own[::-1])), in_order)
+    with pytest.raises(InputError, match="joint_names"):
+        SelfMask(panda(), T_BASE_STATIC_CAMERA, link=0, joint_names=own[:3])
+
+
+def test_an_object_in_the_hand_is_masked_too() -> None:
+    at_hand = panda().fk(START)[-1]
+    plain, held = (
+        SelfMask(panda(), T_BASE_STATIC_CAMERA, link=0, held=spheres) for spheres in (None, [[0.15, 0.0, 0.2, 0.05]])
+    )
+    frame = _front(3.0, START)
+    more = plain.usable(frame) & ~held.usable(frame)
+    center = transform_points(np.linalg.inv(T_BASE_STATIC_CAMERA) @ at_hand, np.array([[0.15, 0.0, 0.2]]))[0]
+    u, v = (frame.camera.K @ (center / center[2]))[:2]
+    rows, columns = np.nonzero(more)
+    # The ring around the point at which the centre appears has the radius of the enlarged sphere, 7 cm.
+    assert len(rows) > 20
+    assert np.hypot(columns - u, rows - v).max() < 1.0 + 100.0 * 0.07 / (center[2] - 0.07)
