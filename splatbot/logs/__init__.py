@@ -11,8 +11,11 @@ from splatbot.logs.base import Log
 from splatbot.logs.calibration import Calibration
 from splatbot.logs.image_folder import ImageFolderLog
 from splatbot.logs.record import record
+from splatbot.logs.record3d import Record3dLog
 from splatbot.logs.replica import ReplicaLog
+from splatbot.logs.scannet import ScanNetLog
 from splatbot.logs.seven_scenes import SevenScenesLog
+from splatbot.logs.transforms import TransformsLog
 from splatbot.logs.tum import Missing, TumLog
 
 __all__ = ["Calibration", "Log", "open_log", "record"]
@@ -21,6 +24,7 @@ _FOLDERS: dict[LogKind, Callable[..., Log]] = {
     "replica": ReplicaLog,
     "7scenes": SevenScenesLog,
     "images": ImageFolderLog,
+    "transforms": TransformsLog,
 }
 
 
@@ -48,8 +52,10 @@ def open_log(
         CameraError: there are no usable intrinsics.
     """
     kind = log_kind(uri)
-    if kind == "synthetic":
-        return _open_synthetic(str(uri), camera)
+    if kind in _OWN_CAMERAS:
+        if camera is not None:
+            raise LogError("the log has its own camera.", file=uri, field="camera", hint="leave --camera out")
+        return _OWN_CAMERAS[kind](str(uri))
     if kind == "bag":
         return _open_bag(str(uri), camera, joint_delay)
     if kind == "tum":
@@ -57,11 +63,9 @@ def open_log(
     return _FOLDERS[kind](Path(uri), camera=camera)
 
 
-def _open_synthetic(uri: str, camera: str | Path | Calibration | None) -> Log:
+def _open_synthetic(uri: str) -> Log:
     from splatbot.logs.synthetic import SyntheticLog  # imports open3d, which takes a second
 
-    if camera is not None:
-        raise LogError("a synthetic log has its own camera.", file=uri, field="camera", hint="leave --camera out")
     return SyntheticLog(uri)
 
 
@@ -70,3 +74,10 @@ def _open_bag(uri: str, camera: str | Path | Calibration | None, joint_delay: fl
 
     path, topics = split_query(uri)
     return BagLog(path, camera=camera, topics=topics, joint_delay=joint_delay)
+
+
+_OWN_CAMERAS: dict[LogKind, Callable[[str], Log]] = {
+    "synthetic": _open_synthetic,
+    "scannet": ScanNetLog,
+    "record3d": Record3dLog,
+}
