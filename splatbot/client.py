@@ -197,7 +197,10 @@ class Client(AbstractContextManager["Client"]):
         return _result(TrackedFrame, answer)
 
     def report_joints(self, robot: str, stamps: ArrayLike, positions: ArrayLike, *, names: Sequence[str] = ()) -> int:
-        """Report joint states, by which a robot is masked in the frames of maps; return the number of masks that use them.
+        """Report joint states, by which a robot is masked in the frames of maps.
+
+        Returns:
+            The number of masks that use them.
 
         Args:
             robot: its name.

@@ -37,7 +37,7 @@ class JointStatesRequest(Body):
 class HeldRequest(Body):
     """Object in the robot's hand, as spheres in the frame of the last link."""
 
-    spheres: list[Vector4] = Field(max_length=MAX_HELD, description="x, y, z, radius [m]; an empty list releases the object")
+    spheres: list[Vector4] = Field(max_length=MAX_HELD, description="x, y, z, radius [m]; if empty, it is released")
 
 
 class NoRobotError(InputError):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -9,13 +10,14 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from splatbot.cli.doubts import camera_doubts
-from splatbot.cli.paths import check_camera
+from splatbot.cli.paths import check_camera, check_output
 from splatbot.cli.tables import print_table
 from splatbot.errors import InputError
 from splatbot.layouts import is_map, log_kind, map_file
 
 if TYPE_CHECKING:
     from splatbot.logs import Log
+    from splatbot.logs.streams import Stream
 
 
 @dataclass(frozen=True)
@@ -40,14 +42,19 @@ def info(
     camera: Annotated[str | None, tyro.conf.arg(metavar="PRESET|FILE")] = None,
     fit_plane: bool = False,
     up: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None,
+    picture: Annotated[Path | None, tyro.conf.arg(metavar="PNG")] = None,
 ) -> int:
     """Describe a map, a log or a run.
 
     Ten frames of a log describe its depth. The shift shows whether depth is registered to colour: it is the distance in
     pixels, right and down, between the edges of both.
 
+    The streams of a TUM folder or of ROS topics are listed with their rates. "missing" counts gaps at the median
+    period, and "clock" is the median time from stamp to reception.
+
     Examples:
-        splatbot info recordings/desk
+        splatbot info recordings/desk --picture first.png
+        splatbot info recording.mcap
         splatbot info runs/latest
         splatbot info map.ply
         splatbot info runs/latest --fit-plane
@@ -60,12 +67,15 @@ def info(
         up: with --fit-plane, upwards in the first camera (x right, y down, z ahead). It is 0 -1 0 for a camera that
             looked ahead, and 0 0 -1 for one that looked straight down. It replaces an existing estimate. By default
             the log's accelerometer decides, if there is one, else the planes of the map.
+        picture: write colour and depth of the log's first frame, side by side.
     """
     from splatbot.cli.fit_plane import fit_plane as fit_plane_command
 
     if up is not None and not fit_plane:
         raise InputError("goes with --fit-plane.", field="--up", hint="give both")
     if is_map(path):
+        if picture is not None:
+            raise InputError("needs a log.", field="--picture", hint=f"splatbot render {path}")
         place = map_file(path)
         print_table(describe_map(place), title=str(place))
         return fit_plane_command(place, up) if fit_plane else 0
@@ -73,10 +83,57 @@ def info(
     check_camera(camera)
     if fit_plane:
         raise InputError("needs a map.", field="--fit-plane", hint="map the log first: splatbot map LOG")
+    check_output(picture, "--picture", folder=False)
     from splatbot.logs import open_log
+    from splatbot.logs.streams import log_streams
 
-    print_table(describe_log(open_log(path, camera=camera)), title=path)
+    streams = log_streams(path)
+    if streams:
+        _print_streams(streams, path)
+    log = open_log(path, camera=camera)
+    print_table(describe_log(log), title=None if streams else path)
+    if picture is not None:
+        _write_picture(log, picture)
     return 0
+
+
+def _print_streams(streams: Sequence[Stream], title: str) -> None:
+    from rich.table import Table
+
+    from splatbot.cli.tables import print_columns
+    from splatbot.results.units import NONE
+
+    table = Table(title=title, title_justify="left")
+    for name in ("stream", "kind"):
+        table.add_column(name)
+    for name in ("messages", "rate", "missing", "repeated", "unordered", "clock"):
+        table.add_column(name, justify="right")
+    table.add_column("first")
+    for s in streams:
+        rate = NONE if s.rate is None else f"{s.rate:.1f} Hz"
+        clock = NONE if s.clock_offset is None else _clock(s.clock_offset)
+        counts = (str(n) for n in (s.dropped, s.duplicates, s.out_of_order))
+        table.add_row(s.name, s.kind, str(s.count), rate, *counts, clock, s.note)
+    print_columns(table)
+
+
+def _clock(offset: float) -> str:
+    return f"{1e3 * offset:+.1f} ms" if abs(offset) < 10.0 else f"{offset:+,.0f} s"
+
+
+def _write_picture(log: Log, path: Path) -> None:
+    """Write the first frame as PNG: colour, and depth from red (near) to blue (far)."""
+    import cv2
+    import numpy as np
+
+    from splatbot.atomic import atomic_write
+    from splatbot.rasterize.views import colorize
+
+    frame = log[0]
+    image = np.hstack([frame.rgb, colorize(frame.depth, "depth")])
+    with atomic_write(path) as file:
+        file.write(cv2.imencode(".png", image[..., ::-1])[1].tobytes())
+    print(f"written: {path}")
 
 
 def describe_map(path: Path) -> list[tuple[str, str]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import struct
+import logging
 from collections import defaultdict
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -36,12 +36,15 @@ from splatbot.logs.ros_frames import (
     seconds_of,
 )
 from splatbot.logs.ros_types import Message, typestore
+from splatbot.logs.streams import bag_streams, header_stamp, obstacle_to_mapping
 from splatbot.logs.undistort import Undistorter
 from splatbot.trajectory import Trajectory
 
 KEYS = ("color", "depth", "info", "joints")
 _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _T = TypeVar("_T")
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -213,7 +216,10 @@ class BagLog(StampedLog):
             if len(some) == 1:
                 return some[0]
         problem = f"several {key} topics ({', '.join(topics)})" if topics else f"no {key} images (topics: {known})"
-        raise LogError(f"holds {problem}.", file=self.path, field=key, hint=f"name one: {self.path.name}?{key}=TOPIC")
+        hint = f"name one: {self.path.name}?{key}=TOPIC"
+        if not topics and (clouds := obstacle_to_mapping(bag_streams(self.path))):
+            hint = clouds
+        raise LogError(f"holds {problem}.", file=self.path, field=key, hint=hint)
 
     def _scan(self) -> dict[str, list[_Entry]]:
         """Index the images by topic, sorted by stamp; only message headers are parsed."""
@@ -223,18 +229,22 @@ class BagLog(StampedLog):
         try:
             for connection, received, raw in self._reader.messages(wanted):
                 key = connection.topic, received
-                found[connection.topic].append(_Entry(self._stamp(raw), received, seen[key]))
+                stamp = header_stamp(raw, ros2=self._reader.is2)
+                found[connection.topic].append(_Entry(stamp, received, seen[key]))
                 seen[key] += 1
         except Exception as error:
             raise self._damaged(error) from error
-        return {topic: sorted(entries, key=lambda e: e.stamp) for topic, entries in found.items()}
+        return {topic: self._distinct(topic, entries) for topic, entries in found.items()}
 
-    def _stamp(self, raw: bytes) -> float:
-        if not self._reader.is2:
-            _seq, sec, nanosec = struct.unpack_from("<III", raw)
-        else:
-            sec, nanosec = struct.unpack_from("<iI" if raw[1] & 1 else ">iI", raw, 4)
-        return float((sec * 10**9 + nanosec) / 10**9)
+    def _distinct(self, topic: str, entries: list[_Entry]) -> list[_Entry]:
+        """Return the entries by stamp; of those with one stamp, the first that was received."""
+        first: dict[float, _Entry] = {}
+        for entry in entries:
+            first.setdefault(entry.stamp, entry)
+        if len(first) < len(entries):
+            count = len(entries) - len(first)
+            _log.warning("%s: %d of %d messages of %s repeat a stamp", self.path, count, len(entries), topic)
+        return sorted(first.values(), key=lambda e: e.stamp)
 
     def _pair(self) -> list[tuple[_Entry, _Entry]]:
         colors, depths = self._index[self._color], self._index[self._depth]
