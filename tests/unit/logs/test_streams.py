@@ -1,4 +1,4 @@
-"""Streams of recordings: what was lost, doubled, late, and of which clock; written by rosbags, read by splatbot."""
+"""Streams of recordings: lost, doubled and late messages, and clocks; written by rosbags, read by splatbot."""
 
 from __future__ import annotations
 
