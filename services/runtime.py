@@ -14,6 +14,7 @@ from typing import Any
 from splatbot.config import Config
 from splatbot.errors import ConfigError, MapNotFoundError, SplatbotError
 from splatbot.frame import Frame
+from splatbot.protocols import FrameSource
 from splatbot.rasterize.native import native
 from splatbot.services.arms import Arms, known_robot
 from splatbot.services.jobs import Job, Jobs, Work
@@ -25,6 +26,7 @@ from splatbot.services.pushed import PushedFrames, StreamEndedError
 from splatbot.services.robot_mask import MaskedSource, RobotMask
 from splatbot.services.scratch import sweep_scratch
 from splatbot.services.settings import ServiceSettings
+from splatbot.services.steady_camera import SteadyCamera
 from splatbot.services.store import MapExistsError, MapStore, ServedMap
 from splatbot.services.topics import JOINTS, JointState, robot_topic
 from splatbot.workspace import Workspace
@@ -102,6 +104,10 @@ class Runtime:
 
     def follow(self, served: ServedMap, source: Iterable[Frame], mapper: LiveMapper) -> None:
         """Map frames in a thread of their own, once the service has begun; the robot in them is masked by the map."""
+        if isinstance(source, FrameSource):
+            source = SteadyCamera(
+                source, self.settings.camera_wait_s, lambda problem: self._report_camera(served, problem)
+            )
         frames = source if served.mask is None else MaskedSource(source, served.mask)
         mapping = LiveMapping(self.store, served, frames, mapper)
         with self._lock:
@@ -110,6 +116,10 @@ class Runtime:
                 self._waiting.append(mapping)  # a recording of the service holds its first frame too
                 return
         self._begin(mapping)
+
+    def _report_camera(self, served: ServedMap, problem: str | None) -> None:
+        with suppress(MapNotFoundError):  # deleted meanwhile
+            self.store.set_state(served.id, "mapping", problem, generation=served.generation)
 
     def open_stream(
         self, map_id: str, *, workspace: Workspace | None = None, mask: RobotMask | None = None

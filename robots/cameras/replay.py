@@ -32,6 +32,7 @@ class ReplayOptions:
         drop: fraction of frames that the device loses, 0..1.
         corrupt: fraction of frames whose transfer is interrupted, so that the lower half is noise.
         unplug: index of the frame at which the device disconnects, -1 for never.
+        replug_s: time [s] after which it can be opened again, with the next frame; 0 for never.
         fault_seed: seed of the dropped and corrupted frames.
     """
 
@@ -42,10 +43,17 @@ class ReplayOptions:
     drop: float = 0.0
     corrupt: float = 0.0
     unplug: int = -1
+    replug_s: float = 0.0
     fault_seed: int = 0
 
     def __post_init__(self) -> None:
-        for name, low, high in (("speed", 1e-3, 1e3), ("stall_s", 0, 3600), ("drop", 0, 1), ("corrupt", 0, 1)):
+        for name, low, high in (
+            ("speed", 1e-3, 1e3),
+            ("stall_s", 0, 3600),
+            ("replug_s", 0, 3600),
+            ("drop", 0, 1),
+            ("corrupt", 0, 1),
+        ):
             value = getattr(self, name)
             if not low <= value <= high:
                 raise InputError(f"is {value}.", field=f"replay {name}", hint=f"give a number in {low:g}..{high:g}")
@@ -55,7 +63,13 @@ class ReplayCamera:
     """A log as a live camera. A slow reader loses the oldest frames, which ``dropped`` counts.
 
     Iterating starts a thread that reads the log and delivers each frame at its time; a log that itself is too slow
-    delivers late. The frames end with the log, or by :meth:`close`.
+    delivers late. The frames end with the log, or by :meth:`close`. A camera that was unplugged goes on where it was,
+    with its clock, when it is iterated again after ``replug_s``.
+
+    Attributes:
+        dropped: frames that a slow reader lost.
+        lost: frames that the device lost, by the option ``drop``.
+        corrupted: frames that were delivered with noise, by the option ``corrupt``.
 
     Args:
         log: any log.
@@ -71,8 +85,11 @@ class ReplayCamera:
         self.name = log.name
         self.uri = PREFIX + log.uri
         self.camera: Camera = log.camera
-        self.dropped = 0
+        self.dropped = self.lost = self.corrupted = 0
         self._log = log
+        self._number, self._offset = 0, 0.0  # of the next frame, and [s] from the log's clock to the camera's
+        self._gone_until: float | None = None  # [s] of the monotonic clock, while unplugged
+        self._for_good = False
         self._queue: deque[Frame | BaseException | object] = deque()
         self._changed = threading.Condition()
         self._closed = threading.Event()
@@ -103,11 +120,22 @@ class ReplayCamera:
 
     def close(self) -> None:
         """End the stream; a waiting reader receives no further frame."""
+        self._for_good = True
+        self._end()
+
+    def _end(self) -> None:
         self._closed.set()
         with self._changed:
             self._changed.notify_all()
 
     def __iter__(self) -> Iterator[Frame]:
+        if self._for_good:
+            return
+        if self._gone_until is not None:
+            if time.monotonic() < self._gone_until:
+                raise self._gone()
+            self._offset, self._gone_until = self._offset + self.options.replug_s, None
+        self._closed, self._queue = threading.Event(), deque()
         threading.Thread(target=self._run, name=f"camera-{self.name}", daemon=True).start()
         try:
             while True:
@@ -121,33 +149,45 @@ class ReplayCamera:
                 assert isinstance(taken, Frame)
                 yield taken
         finally:
-            self.close()
+            self._end()
+
+    def _gone(self) -> DeviceError:
+        return DeviceError("is gone.", file=self.uri, field="camera", hint="plug it in and start again")
 
     def _run(self) -> None:
+        closed, unplug = self._closed, self.options.unplug
         try:
-            for number, frame in self._frames():
-                if number == self.options.unplug:
-                    raise DeviceError("is gone.", file=self.uri, field="camera", hint="plug it in and start again")
-                if self._rng.random() >= self.options.drop:
-                    self._deliver(self._damaged(frame) if self._rng.random() < self.options.corrupt else frame)
-                if self._closed.is_set():
+            for number, frame in self._frames(closed):
+                self._number = number + 1
+                if number == unplug:
+                    self._gone_until = time.monotonic() + (self.options.replug_s or np.inf)
+                    raise self._gone()
+                if self._rng.random() < self.options.drop:
+                    self.lost += 1
+                elif self._rng.random() < self.options.corrupt:
+                    self.corrupted += 1
+                    self._deliver(self._damaged(frame))
+                else:
+                    self._deliver(frame)
+                if closed.is_set():
                     return
             self._deliver(_END)
         except Exception as error:
             self._deliver(error)
 
-    def _frames(self) -> Iterator[tuple[int, Frame]]:
-        """Yield frames at their times, numbered over all loops, until the camera is closed."""
-        number, offset, late = 0, 0.0, 0.0
+    def _frames(self, closed: threading.Event) -> Iterator[tuple[int, Frame]]:
+        """Yield frames at their times, numbered over all loops, from the next one until the camera is closed."""
+        number, offset, late = self._number, self._offset, 0.0
         begun: tuple[float, float] | None = None
         while True:
             period = last = 0.0
-            for frame in self._log:
+            for index in range(number % len(self._log), len(self._log)):
+                frame = self._log.read(index)
                 stamp = frame.stamp + offset
                 begun = begun or (time.monotonic(), stamp)
                 late += self.options.stall_s if number == self.options.stall else 0.0
                 due = begun[0] + (stamp - begun[1]) / self.options.speed + late
-                if self._closed.wait(max(due - time.monotonic(), 0.0)):
+                if closed.wait(max(due - time.monotonic(), 0.0)):
                     return
                 yield number, replace(frame, stamp=stamp, index=number)
                 period, last = (frame.stamp - last if last else 0.0), frame.stamp
@@ -155,6 +195,7 @@ class ReplayCamera:
             if not self.options.loop:
                 return
             offset += last - self._log.read(0).stamp + (period or 1.0)
+            self._offset = offset
 
     def _deliver(self, item: Frame | BaseException | object) -> None:
         with self._changed:

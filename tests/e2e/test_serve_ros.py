@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+import pytest
 from websockets.sync.client import connect
 
 from splatbot.logs import open_log
@@ -16,7 +17,10 @@ from tests.e2e.test_serve_cli import serving
 LOG = "synthetic:tabletop?frames=12&width=160&height=120"
 
 
-def test_a_camera_that_is_unplugged_leaves_its_map_odometry_and_a_recording_that_is_a_log(tmp_path: Path) -> None:
+def test_a_camera_that_is_unplugged_leaves_its_map_odometry_and_a_recording_that_is_a_log(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SPLATBOT_CAMERA_WAIT_S", "0")
     camera = f"replay:{LOG}&speed=0.1&unplug=9"
     options = "--record", str(tmp_path / "all.mcap"), "--ros-port", "0", "--viewer-port", "0"
     with serving("--camera", camera, *options) as (process, client):
