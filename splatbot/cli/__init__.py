@@ -39,6 +39,9 @@ COMMANDS = {
     ),
     "simulate": _Command("splatbot.cli.simulate", "simulate", "Record a synthetic log with exact depth and poses."),
     "record": _Command("splatbot.cli.record", "record", "Write a log as one MCAP file of ROS 2 messages."),
+    "convert-log": _Command(
+        "splatbot.cli.convert_log", "convert_log", "Write a log of any format as a TUM folder or an MCAP file."
+    ),
     "serve": _Command("splatbot.cli.serve", "serve", "Serve a map over HTTP."),
     "view": _Command("splatbot.cli.view", "view", "Show a map in a web browser, or write it as one HTML page."),
     "plan": _Command(

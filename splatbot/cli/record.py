@@ -21,7 +21,8 @@ def record(
 ) -> None:
     """Write a log as one MCAP file of ROS 2 messages, which Foxglove, ROS tools and splatbot itself read.
 
-    Nothing is rounded: mapping the file gives the trajectory that mapping the log gives.
+    Nothing is rounded: mapping the file gives the trajectory that mapping the log gives. `splatbot convert-log` also
+    writes TUM folders.
 
     Examples:
         splatbot record recordings/desk --out desk.mcap

@@ -143,3 +143,22 @@ class DerivedLog(LogBase):
 
     def __len__(self) -> int:
         return len(self._log)
+
+
+class FirstFrames(DerivedLog):
+    """The first frames of a log.
+
+    Args:
+        log: the whole log.
+        count: largest number of frames.
+    """
+
+    def __init__(self, log: Log, count: int) -> None:
+        super().__init__(log)
+        self._count = count
+
+    def __len__(self) -> int:
+        return min(self._count, len(self._log))
+
+    def _decode(self, index: int) -> Frame:
+        return self._log.read(index)

@@ -17,7 +17,7 @@ from splatbot.geometry import inverse
 from splatbot.logs.base import MILLIMETRES
 from splatbot.logs.calibration import Calibration, make_calibration, read_calibration, read_object
 from splatbot.logs.image_size import image_size
-from splatbot.logs.pairs import RATE, Pair, PairLog, numbered_files, pair_files
+from splatbot.logs.pairs import RATE, ImagePair, PairLog, numbered_files, pair_files
 from splatbot.logs.poses import read_matrix, rigid_pose
 from splatbot.logs.presets import find_calibration
 from splatbot.logs.registration import ColorRegistration
@@ -77,7 +77,7 @@ def _stamps(path: Path, numbers: Sequence[int]) -> dict[int, float]:
 
 
 def _calibrate(
-    folder: Path, pairs: Sequence[Pair], camera: str | Path | Calibration | None
+    folder: Path, pairs: Sequence[ImagePair], camera: str | Path | Calibration | None
 ) -> tuple[Calibration, ColorRegistration | None]:
     """Return the calibration of the frames, and the registration of colour if it has a camera of its own."""
     if camera is not None:
@@ -107,7 +107,7 @@ def _open3d_calibration(path: Path) -> Calibration:
     return make_calibration(path, named, scale_key="depth_scale")
 
 
-def _scannet_calibration(folder: Path, pairs: Sequence[Pair]) -> tuple[Calibration, ColorRegistration]:
+def _scannet_calibration(folder: Path, pairs: Sequence[ImagePair]) -> tuple[Calibration, ColorRegistration]:
     color, depth = (
         scannet_camera(folder / f"intrinsic_{part}.txt", read_matrix(folder / f"intrinsic_{part}.txt"), size)
         for part, size in (("color", _size([p.color for p in pairs])), ("depth", _size([p.depth for p in pairs])))

@@ -31,7 +31,7 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Pair:
+class ImagePair:
     """Images of one frame: the number in their names, the files of colour and depth."""
 
     number: int
@@ -62,13 +62,13 @@ def numbered_files(folder: Path, pattern: str) -> dict[int, Path]:
     return found
 
 
-def pair_files(folder: Path, colors: dict[int, Path], depths: dict[int, Path]) -> tuple[list[Pair], int]:
+def pair_files(folder: Path, colors: dict[int, Path], depths: dict[int, Path]) -> tuple[list[ImagePair], int]:
     """Return the pairs of equal numbers in their order, and the count of images without a partner, which is logged.
 
     Raises:
         LogError: there is no pair.
     """
-    pairs = [Pair(n, colors[n], depths[n]) for n in sorted(colors.keys() & depths.keys())]
+    pairs = [ImagePair(n, colors[n], depths[n]) for n in sorted(colors.keys() & depths.keys())]
     if not pairs:
         raise LogError(
             f"the log is empty: {len(colors)} colour and {len(depths)} depth images have no number in common.",
@@ -96,7 +96,7 @@ class PairLog(FolderLog, StampedLog):
     def __init__(
         self,
         folder: str | Path,
-        pairs: Sequence[Pair],
+        pairs: Sequence[ImagePair],
         stamps: list[float],
         calibration: Calibration,
         registration: ColorRegistration | None = None,

@@ -46,7 +46,7 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class _Entry:
+class _FramePlace:
     """Place of one frame in the file."""
 
     T_world_camera: NDArray[np.float64] | None
@@ -173,9 +173,9 @@ class ScanNetLog(ReaderLog, StampedLog):
         return LogError(f"{problem}.", file=self.path, field=field, hint=hint)
 
 
-def _scan(file: BinaryIO, count: int, size: int) -> list[_Entry]:
+def _scan(file: BinaryIO, count: int, size: int) -> list[_FramePlace]:
     """Return the places of the whole frames from the current position of a file of a size [bytes]."""
-    entries: list[_Entry] = []
+    entries: list[_FramePlace] = []
     while len(entries) < count:
         head = file.read(_FRAME.size)
         if len(head) < _FRAME.size:
@@ -185,6 +185,6 @@ def _scan(file: BinaryIO, count: int, size: int) -> list[_Entry]:
         if at + color_bytes + depth_bytes > size:
             break
         pose = rigid_pose(np.array(matrix).reshape(4, 4))
-        entries.append(_Entry(pose, microseconds, at, color_bytes, depth_bytes))
+        entries.append(_FramePlace(pose, microseconds, at, color_bytes, depth_bytes))
         file.seek(color_bytes + depth_bytes, os.SEEK_CUR)
     return entries
