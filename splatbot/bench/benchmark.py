@@ -41,6 +41,7 @@ BENCHMARKS = {
     "thin": Entry("splatbot.bench.thin", "Measure missed probes on thin, transparent and black objects."),
     "planning": Entry("splatbot.bench.planning", "Measure the planner: paths over time budgets, checked exactly."),
     "grasping": Entry("splatbot.bench.grasping", "Measure grasping: candidates per second, errors of the contacts."),
+    "logs": Entry("splatbot.bench.logs", "Measure the reading of logs: frames per second of each layout."),
     "service": Entry("splatbot.bench.service", "Measure the service: mapping under queries, and the cost of HTTP."),
 }
 

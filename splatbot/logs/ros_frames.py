@@ -64,11 +64,10 @@ def color_of(message: Message) -> NDArray[np.uint8]:
     """
     if hasattr(message, "format"):
         return np.ascontiguousarray(_decode(message, message.data, cv2.IMREAD_COLOR)[..., ::-1])
-    channels = {"rgb8": [0, 1, 2], "bgr8": [2, 1, 0], "rgba8": [0, 1, 2], "bgra8": [2, 1, 0]}
-    if message.encoding not in channels:
+    if message.encoding not in COLOR_ENCODINGS:
         raise _encoding(message, COLOR_ENCODINGS)
-    pixels = _pixels(message, np.dtype(np.uint8), len(message.encoding) - 1)
-    return np.ascontiguousarray(pixels[..., channels[message.encoding]])
+    pixels = _pixels(message, np.dtype(np.uint8), len(message.encoding) - 1)[..., :3]
+    return np.array(pixels if message.encoding.startswith("rgb") else pixels[..., ::-1], order="C")
 
 
 def size_of(message: Message) -> tuple[int, int]:
