@@ -81,7 +81,7 @@ class MapInfo(BaseModel):
     id: str = Field(description="name in URLs")
     map_version: int = Field(description="grows with every published state; 0: nothing yet")
     state: Literal["static", "mapping", "ended", "failed"] = Field(description="static: from a file")
-    detail: str | None = Field(None, description="why mapping failed")
+    detail: str | None = Field(None, description="why mapping failed, or waits for its camera")
     source: str = Field(description="file, log or camera of the map")
     gaussians: int = Field(description="number of Gaussians")
     bytes: int = Field(description="memory of the Gaussians")

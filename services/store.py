@@ -46,7 +46,7 @@ class ServedMap:
         id: its name in URLs.
         source: its origin, for display.
         state: origin, and whether it still grows.
-        detail: why it failed.
+        detail: why it failed, or waits for its camera.
         snapshot: None before the first state is published.
         trajectory: of the camera, as far as ``snapshot`` knows it; None where there was none.
         workspace: pose of the robot's base in it, if known.

@@ -152,11 +152,11 @@ def interpolate_joints(
 ) -> NDArray[np.float64] | None:
     """Interpolate joint positions (N, J) [rad] at stamps (N,) [s] to one stamp; see :meth:`JointRecord.at`."""
     after = int(np.searchsorted(stamps, stamp))
-    neighbours = stamps[max(after - 1, 0) : after + 1]
-    gaps = np.abs(neighbours - stamp)
+    near = slice(max(after - 1, 0), after + 1)
+    gaps = np.abs(stamps[near] - stamp)
     if gaps.min() > 0 and gaps.max() > MAX_GAP:
         return None
-    return np.array([np.interp(stamp, stamps, column) for column in joints.T])
+    return np.array([np.interp(stamp, stamps[near], column) for column in joints[near].T])
 
 
 def find_joints(folder: Path) -> JointRecord | None:
