@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +25,9 @@ class JointDelayConstants:
     """Constants of the estimate.
 
     Args:
-        frames: most frames that are compared; more change the result by less than its standard deviation.
+        frames: most frames that are compared, from the middle of the log.
+        spacing: [s] between them, if the log has as many; joints are interpolated between them.
+        largest_spacing: [s] beyond which motion between frames is not known.
         least_frames: least number of them.
         width: width [px] to which images are subsampled.
         background: quantile of a pixel's depths that is its background; the arm hides a pixel for less of the time.
@@ -37,7 +40,9 @@ class JointDelayConstants:
         largest_sigma: [s] largest standard deviation of a useful estimate; the arm moves 1 cm meanwhile at 1 m/s.
     """
 
-    frames: int = 80
+    frames: int = 120
+    spacing: float = 0.1
+    largest_spacing: float = 0.25
     least_frames: int = 15
     width: int = 80
     background: float = 0.8
@@ -163,8 +168,12 @@ def _peak(delays: Array, table: Array) -> tuple[float, float]:
 
 
 def _frames(log: Log, names: tuple[str, ...]) -> list[Frame]:
-    """Return evenly spread frames with joints in the robot's order, subsampled to a small size."""
-    chosen = np.unique(np.linspace(0, len(log) - 1, min(len(log), CONSTANTS.frames)).round().astype(int)).tolist()
+    """Return frames with joints in the robot's order, subsampled to a small size, without gaps in time."""
+    middle = len(log) // 2
+    period = max(1e-3, abs(log[min(middle + 1, len(log) - 1)].stamp - log[middle].stamp))
+    every = max(1, int(CONSTANTS.spacing / period + 1e-6))
+    first = max(0, middle - CONSTANTS.frames * every // 2)
+    chosen = range(first, len(log), every)[: CONSTANTS.frames]
     kept: list[Frame] = []
     for k in chosen:
         try:
@@ -177,6 +186,10 @@ def _frames(log: Log, names: tuple[str, ...]) -> list[Frame]:
     if len(kept) < CONSTANTS.least_frames:
         hint = "record joint states with the images, at 10 Hz or more"
         raise InputError(f"has {len(kept)} frames with joints.", file=log.uri, field="joints", hint=hint)
+    gap = max(b.stamp - a.stamp for a, b in pairwise(kept))
+    if gap > CONSTANTS.largest_spacing:
+        hint = "record frames and joint states without pauses, at 5 Hz or more"
+        raise InputError(f"has {gap:.2f} s between frames with joints.", file=log.uri, field="joints", hint=hint)
     return kept
 
 

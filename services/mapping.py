@@ -102,7 +102,7 @@ def _map(
 ) -> dict[str, Any]:
     from splatbot.slam import Slam
 
-    recorded = (log.read(i) for i in range(total))
+    recorded = (log.read(i) for i in range(total) if not handle.cancelled.is_set())
     frames = recorded if served.mask is None else MaskedSource(recorded, served.mask)
     tracked = 0
 
@@ -123,6 +123,8 @@ def _map(
     runtime.save(made)
     if handle.cancelled.is_set():
         raise JobCancelled
+    if served.mask is not None and not served.mask.masked:
+        raise LogError(served.mask.problem or "no frame was mapped.", field="joints")
     if made.state == "failed":
         raise LogError(made.detail or "mapping failed.", field="log")
     return {"map": made.id, "map_version": made.map_version, "frames": total, "tracked": tracked}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import queue
 import threading
 from collections.abc import Callable, Iterator
@@ -16,6 +17,7 @@ from splatbot.slam import FrameResult
 MAX_STAMP_S = 1e11  # in the year 5138; larger numbers are not seconds
 MAX_PAUSE_S = 86_400.0  # [s] between two frames
 _MAX_INTERVAL_S = 0.1  # [s] largest time in the map between the frames before and after a jump of the clock
+_log = logging.getLogger(__name__)
 _RESYNC = "if the clock was set, POST /v1/maps/ID/resync first"
 
 
@@ -116,6 +118,10 @@ class PushedFrames:
                 masked = frame if self._mask is None else self._mask(frame)  # by the stamps of the camera's clock
             except SplatbotError as error:
                 self.refuse(index, error)
+                continue
+            except Exception:  # a defect: the other frames are mapped all the same
+                _log.exception("the robot in frame %d cannot be masked", index)
+                self.refuse(index, InputError("the robot in the frame cannot be masked.", field="joints"))
                 continue
             yield replace(masked, index=index, stamp=stamp)
 

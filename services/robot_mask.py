@@ -25,8 +25,10 @@ from splatbot.workspace import Workspace
 MAX_HELD = 64
 """Largest number of spheres of an object in the hand."""
 _KEPT_S = 10.0  # [s] of joint states
+_SET_BACK_S = 0.5  # [s] by which a state may be older than the newest one
 _KEPT = 20_000  # joint states: 2 kHz over that time
 _WAIT_S = 0.15  # [s] for the joint state after an image
+_SAME_TIME_S = 1e-3  # [s] between colour and depth in which an arm moves by less than the noise of depth
 _REPORT_S = 10.0  # [s] between two warnings about frames that are not mapped
 
 _log = logging.getLogger(__name__)
@@ -43,13 +45,24 @@ class JointHistory:
         self.names = tuple(names)
         self._stamps: list[float] = []
         self._positions: list[NDArray[np.float64]] = []
+        self._named = False
         self._changed = threading.Condition()
+
+    def clear(self) -> None:
+        """Forget all states: the clock was set."""
+        with self._changed:
+            self._forget()
+
+    def _forget(self) -> None:
+        self._stamps.clear()
+        self._positions.clear()
 
     def add(self, state: JointState) -> bool:
         """Add a joint state, in any order. States from before a clock was set back are forgotten.
 
         Returns:
-            False if the state has no joint of the robot, as that of a gripper.
+            False if the state has no joint of the robot, as that of a gripper, or numbers its joints although others
+            have names.
 
         Raises:
             InputError: the state has only some joints of the robot, or a value is not finite.
@@ -62,10 +75,13 @@ class JointHistory:
             raise
         if not np.isfinite(q).all() or not np.isfinite(state.stamp):
             raise InputError("has values that are not finite.", field="joints", hint="give seconds, radians and metres")
+        named = not set(state.names).isdisjoint(self.names)
         with self._changed:
-            if self._stamps and self._stamps[-1] - state.stamp > _KEPT_S:
-                self._stamps.clear()
-                self._positions.clear()
+            if self._named and not named:
+                return False  # of another device, which numbers its joints
+            if self._stamps and self._stamps[-1] - state.stamp > _SET_BACK_S:
+                self._forget()
+            self._named = self._named or named
             at = bisect.bisect_left(self._stamps, state.stamp)
             if at < len(self._stamps) and self._stamps[at] == state.stamp:
                 self._positions[at] = q
@@ -129,22 +145,34 @@ class RobotMask:
         """Time [s] by which the stamps of joint states are later than the motion."""
         return self._workspace.joint_delay
 
-    def __call__(self, frame: Frame) -> Frame:
-        """Return the frame with the robot masked.
+    def __call__(self, frame: Frame, *, live: bool = True) -> Frame:
+        """Return the frame with the robot masked at the times of colour and of depth.
+
+        Args:
+            frame: the frame.
+            live: whether joint states of the history belong to the frame; those of a recording do not.
 
         Raises:
             JointsUnknownError: the joints at the time of the frame are missing or stale.
         """
         try:
-            if frame.joints is None:
-                q = self.history.at(frame.stamp + self.joint_delay, _WAIT_S + max(self.joint_delay, 0.0))
-                frame = replace(frame, joints=q, joint_names=self.history.names)
-            masked = self._mask(frame)
+            if live and frame.joints is None:
+                masked = self._mask(self._with_joints(frame, 0.0))
+                if abs(frame.depth_delay) > _SAME_TIME_S:
+                    masked = self._mask(self._with_joints(masked, frame.depth_delay))
+            else:
+                masked = self._mask(frame)
         except JointsUnknownError as error:
             self._refuse(error)
             raise
         self.masked, self.problem = self.masked + 1, None
         return masked
+
+    def _with_joints(self, frame: Frame, after: float) -> Frame:
+        """Return the frame with the joints at a time [s] after its stamp."""
+        delay = after + self.joint_delay
+        q = self.history.at(frame.stamp + delay, _WAIT_S + max(delay, 0.0))
+        return replace(frame, joints=q, joint_names=self.history.names)
 
     def hold(self, spheres: ArrayLike) -> None:
         """Mask an object in the hand from the next frame on.
@@ -172,6 +200,8 @@ class RobotMask:
 class MaskedSource:
     """The frames of a log or a camera with the robot masked; frames that the mask refuses are left out.
 
+    Frames of a log are masked by their own joints alone.
+
     Args:
         source: the frames.
         mask: of their robot.
@@ -179,16 +209,20 @@ class MaskedSource:
 
     def __init__(self, source: Iterable[Frame], mask: RobotMask) -> None:
         self._source, self._mask = source, mask
+        self._live, self._closed = isinstance(source, FrameSource), threading.Event()
         self.name, self.uri = str(getattr(source, "name", "")), str(getattr(source, "uri", ""))
 
     def __iter__(self) -> Iterator[Frame]:
         for frame in self._source:
+            if self._closed.is_set():
+                return
             try:
-                yield self._mask(frame)
+                yield self._mask(frame, live=self._live)
             except JointsUnknownError:
                 continue  # the mask counts and reports it
 
     def close(self) -> None:
-        """End the stream of a camera; a log ends by itself."""
+        """End the stream."""
+        self._closed.set()
         if isinstance(self._source, FrameSource):
             self._source.close()

@@ -12,7 +12,7 @@ from contextlib import suppress
 from typing import Any
 
 from splatbot.config import Config
-from splatbot.errors import ConfigError, MapNotFoundError, SplatbotError
+from splatbot.errors import ConfigError, InputError, MapNotFoundError, SplatbotError
 from splatbot.frame import Frame
 from splatbot.protocols import FrameSource
 from splatbot.rasterize.native import native
@@ -175,6 +175,9 @@ class Runtime:
             mask = self._mask_of_topics or self.new_mask(self.workspace)
             self.open_stream(map_id, workspace=self.workspace, mask=mask)
             self._mask_of_topics = self.new_mask(self.workspace)  # of the next map of that name
+        if self.robot is not None and self.store.get(map_id).mask is None:
+            hint = f"delete it: the robot in frames of ROS topics is masked in a map {map_id!r} of its own"
+            raise InputError(f"map {map_id!r} masks no robot.", field="map", hint=hint)
         self.stream(map_id).push(frame)
 
     def new_mask(self, workspace: Workspace | None) -> RobotMask | None:
@@ -192,11 +195,20 @@ class Runtime:
             The number of masks that keep them: those of maps, and that of the next map of ROS topics.
 
         Raises:
-            InputError: the state lacks a joint of such a map's robot, or a value is not finite.
+            InputError: no mask can keep them, because joints are missing or a value is not finite.
         """
-        masks = [self._mask_of_topics, *(served.mask for served in self.store.list())]
-        kept = sum(mask.history.add(state) for mask in masks if mask is not None and mask.robot.name == robot)
         self.bus.publish(robot_topic(robot, JOINTS), state)
+        masks = [self._mask_of_topics, *(served.mask for served in self.store.list() if served.state == "mapping")]
+        kept, problem = 0, None
+        for mask in masks:
+            if mask is None or mask.robot.name != robot:
+                continue
+            try:
+                kept += mask.history.add(state)
+            except InputError as error:  # the other masks keep them all the same
+                problem = error
+        if problem is not None and not kept:
+            raise problem
         return kept
 
     def make(self, served: ServedMap, work: Work, **more: Any) -> Job:

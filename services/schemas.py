@@ -102,7 +102,7 @@ class RobotInView(Request):
 
     name: str = Field(description="robot, as `splatbot robot list` names it")
     T_link_camera: Pose | None = Field(
-        None, description="pose of the camera on its link; null: all values are those of the recording's scene.yaml"
+        None, description="pose of the camera on its link; values left out are those of the recording's scene.yaml"
     )
     camera_link: int = Field(-1, description="index of the link that carries the camera; -1: the last, 0: the base")
     joint_offsets: list[float] | None = Field(
@@ -119,21 +119,18 @@ class RobotInView(Request):
     )
 
     def workspace(self, known: Workspace | None) -> Workspace | None:
-        """Return the workspace with this camera, or the known one unchanged if no pose of the camera is given.
+        """Return the workspace with the given values; the others are those of the known one.
 
         Raises:
             InputError: a value is invalid.
         """
-        if self.T_link_camera is None:
-            return known
-        return replace(
-            known or Workspace(),
-            T_link_camera=self.T_link_camera.matrix("T_link_camera"),
-            camera_link=self.camera_link,
-            joint_offsets=None if self.joint_offsets is None else np.array(self.joint_offsets),
-            joint_delay=self.joint_delay,
-            joint_names=tuple(self.joint_names),
-        )
+        given: dict[str, Any] = {name: getattr(self, name) for name in self.model_fields_set - {"name"}}
+        if self.T_link_camera is not None:
+            given["T_link_camera"] = self.T_link_camera.matrix("T_link_camera")
+        if self.joint_offsets is not None:
+            given["joint_offsets"] = np.array(self.joint_offsets)
+        given["joint_names"] = tuple(given.get("joint_names", known.joint_names if known is not None else ()))
+        return replace(known or Workspace(), **given)
 
 
 class JointStatesTaken(BaseModel):

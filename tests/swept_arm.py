@@ -24,9 +24,9 @@ def sweep(stamps: Array) -> Array:
     return START + np.sin(phase) * np.array([0.55, 0.1, 0.0, 0.15, 0.0, 0.1, 0.2])
 
 
-def static_log(seconds: float, *, rate: float = 5.0, width: int = 160) -> WristLog:
-    """Return frames of the static camera with the arm that sweeps in view."""
-    joints = sweep(np.arange(round(seconds * rate)) / rate)
+def static_log(seconds: float, *, rate: float = 5.0, width: int = 160, moves: bool = True) -> WristLog:
+    """Return frames of the static camera with the arm in view, which sweeps or is at rest."""
+    joints = sweep(np.arange(round(seconds * rate)) / rate * moves)
     return WristLog(
         panda(),
         joints,

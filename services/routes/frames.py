@@ -41,7 +41,7 @@ class FrameRequest(Body):
     depth: Any = Field(description="16-bit PNG, or array; 0 where it is not known")
     depth_scale: float = Field(1000.0, gt=0, allow_inf_nan=False, description="units per metre of an integer depth")
     mask: Any = Field(None, description="PNG or bool array; a pixel that is 0 is neither tracked nor mapped")
-    depth_delay: float = Field(0.0, ge=-1.0, le=1.0, description="time by which depth is later than `stamp` [s]")
+    depth_delay: float = Field(0.0, ge=-0.1, le=0.1, description="time by which depth is later than `stamp` [s]")
     joints: list[float] | None = Field(
         None, max_length=MAX_JOINTS, description="the robot's joints [rad or m] at `stamp`"
     )
@@ -129,6 +129,8 @@ def resync_frames(served: Served, service: Service) -> Response:
     In the map time goes on: if the clock was set back, later stamps are shifted, also in answers and trajectories.
     """
     service.stream(served.id).resync()
+    if served.mask is not None:
+        served.mask.history.clear()
     return Response(status_code=204)
 
 

@@ -169,7 +169,8 @@ async def upload_map(
 @router.get("/{map_id}", responses=example(_EXAMPLE) | problems(404))
 def get_map(served: Served, request: Request, response: Response) -> Any:
     """Describe a map; `state` and `detail` report the progress of mapping."""
-    tag = etag(served)
+    robot = None if served.mask is None else _masked(served.mask)
+    tag = etag(served, f"{served.detail} {robot}")
     if (kept := unchanged(request, served, tag)) is not None:
         return kept
     response.headers.update(version_headers(served, tag))

@@ -62,7 +62,7 @@ def report_joints(
 ) -> JointStatesTaken:
     """Report a robot's joint states, by which it is masked in frames without joints of their own."""
     name, kept = known_robot(robot).name, 0
-    for state in query.states:
+    for state in sorted(query.states, key=lambda given: given.stamp):
         if state.names and len(state.names) != len(state.position):
             hint = "give one position for each name"
             raise InputError(f"has {len(state.position)} values.", field="position", hint=hint)

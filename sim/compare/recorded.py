@@ -88,7 +88,7 @@ class ArmRecord:
         """
         q = None if self.joints is None else self.joints.at(stamp)
         if q is not None and self.joints is not None and self.joints.names:
-            return select_joints(self.joints.names, q, robot.chain.names)
+            return select_joints(self.joints.names, q, self.workspace.joint_names or robot.chain.names)
         if q is not None and len(q) != len(robot):
             raise InputError(
                 f"has {len(q)} joints, {robot.name} has {len(robot)}.", field="joints.txt", hint="name the arm: --robot"

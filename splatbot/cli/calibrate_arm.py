@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -133,6 +134,7 @@ def calibrate_hand_eye_command(
     check_output(out, folder=False)
     scene = Workspace.load(out) if out is not None and out.exists() else Workspace()
     arm = None if robot is None else load_robot(robot)
+    names = scene.joint_names or (() if arm is None else tuple(arm.chain.names))
     if arm is not None and link is not None and abs(link) > len(arm.chain):
         raise InputError(f"is {link}.", field="--link", hint=f"{robot} has links 1..{len(arm.chain)} that move")
     if link == 0:
@@ -148,11 +150,11 @@ def calibrate_hand_eye_command(
         if joints is not None or poses is not None or same_clock:
             hint = "leave them out: joints come with the images"
             raise InputError("goes without --board.", field="--joints, --poses, --same-clock", hint=hint)
-        motion, measured = _board_problem(source, board, arm, carrier, camera, eye_to_hand, max_views, quiet)
+        motion, measured = _board_problem(source, board, arm, names, carrier, camera, eye_to_hand, max_views, quiet)
     else:
         if eye_to_hand or camera is not None:
             raise InputError("needs --board.", field="--eye-to-hand, --camera", hint="give --board, or leave it out")
-        motion, measured, delay = _tracked_problem(source, arm, carrier, joints, poses, same_clock)
+        motion, measured, delay = _tracked_problem(source, arm, names, carrier, joints, poses, same_clock)
     if arm is None and out is not None and link is None and not eye_to_hand:
         hint = "give the link whose frame the recorded poses are of (-1: the last), or --robot NAME with joints"
         raise InputError("is not known without a robot.", field="--link", hint=hint)
@@ -194,6 +196,7 @@ def _board_problem(
     source: str,
     board: str,
     arm: RobotKinematics | None,
+    names: Sequence[str],
     link: int,
     camera: str | None,
     eye_to_hand: bool,
@@ -217,7 +220,7 @@ def _board_problem(
     else:
         lens = _camera(camera, recording.size)
     seen = [(at, view) for at, view in zip(recording.arms, recording.views, strict=True) if view.usable]
-    known = [(at.T_base_link if arm is None else _ordered(at, arm), view) for at, view in seen]
+    known = [(at.T_base_link if arm is None else _ordered(at, names), view) for at, view in seen]
     values, views = [value for value, _ in known if value is not None], [v for value, v in known if value is not None]
     if not values:
         hint = "give --robot NAME and joints with the images" if arm is None else "write joint_values: [q1, ...]"
@@ -228,12 +231,12 @@ def _board_problem(
     return motion, BoardMeasurement(tuple(views), lens, not eye_to_hand)
 
 
-def _ordered(at: ArmView, arm: RobotKinematics) -> Array | None:
+def _ordered(at: ArmView, names: Sequence[str]) -> Array | None:
     from splatbot.logs.joints import select_joints
 
     if at.joints is None or not at.joint_names:
         return at.joints
-    return select_joints(at.joint_names, at.joints, arm.chain.names)
+    return select_joints(at.joint_names, at.joints, names)
 
 
 def _by_joints(arm: RobotKinematics, joints: Array, link: int, source: str, stamps: Array | None = None) -> LinkMotion:
@@ -265,6 +268,7 @@ def _camera(name: str, size: tuple[int, int]) -> Camera:
 def _tracked_problem(
     source: str,
     arm: RobotKinematics | None,
+    names: Sequence[str],
     link: int,
     joints: Path | None,
     poses: Path | None,
@@ -291,7 +295,7 @@ def _tracked_problem(
         if arm is None:
             raise InputError("needs the arm of the joints.", file=joints, field="--robot", hint="give --robot NAME")
         record = JointRecord(joints)
-        positions = record.ordered(arm.chain.names) if record.names else record.joints
+        positions = record.ordered(names) if record.names else record.joints
         motion = _by_joints(arm, positions, link, str(joints), record.stamps)
     else:
         recorded = load_trajectory(str(poses), unordered=True)
@@ -347,14 +351,14 @@ def _completed(
         camera_link=link,
         joint_offsets=offsets if offsets.any() else None,
         T_world_base=inverse(found.T_base_static) if tracked else scene.T_world_base,
-        joint_delay=_joint_delay(found) if tracked and arm is not None else scene.joint_delay,
+        joint_delay=_joint_delay(found, scene.joint_delay) if tracked and arm is not None else scene.joint_delay,
     )
 
 
-def _joint_delay(found: HandEyeCalibration) -> float:
-    """Return the delay [s] of joint states for masks; 0 if both recordings have one clock, or unrelated ones."""
+def _joint_delay(found: HandEyeCalibration, known_before: float) -> float:
+    """Return the delay [s] of joint states for masks, or the one known before if the recordings do not determine it."""
     from splatbot.workspace import MAX_JOINT_DELAY_S
 
     delay = found.delay
     known = delay is not None and not delay.refusal and abs(delay.value) <= MAX_JOINT_DELAY_S
-    return delay.value if known and delay is not None else 0.0
+    return delay.value if known and delay is not None else known_before

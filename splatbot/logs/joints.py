@@ -13,13 +13,14 @@ from splatbot.errors import InputError, LogError
 
 NAME = "joints.txt"
 _HEADER = "# stamp"
+HOLD = 0.02  # [s] before the first line and after the last one, in which an arm at 1 m/s moves by 2 cm
 MAX_GAP = 0.1  # [s] to the neighbouring lines beyond which joint positions are not interpolated
 
 
 class JointRecord:
     """Joint positions over time with linear interpolation: ``stamps`` (N,) [s] and ``joints`` (N, J) [rad].
 
-    Lines are `stamp q1 q2 ...`. A first line `# stamp NAME NAME ...` gives the joints' ``names``; without it they are
+    Lines are `stamp q1 q2 ...`. A line `# stamp NAME NAME ...` gives the joints' ``names``; without it they are
     empty, and the positions are in the robot's order.
 
     Args:
@@ -54,10 +55,13 @@ class JointRecord:
             raise LogError("is empty.", file=path, hint="write lines `stamp q1 q2 ...`, or remove it")
         table = np.array(rows)
         self.stamps, self.joints = table[:, 0], table[:, 1:]
-        self.names = _names(lines[0], self.joints.shape[1])
+        self.names = _names(path, lines, self.joints.shape[1])
 
     def at(self, stamp: float) -> NDArray[np.float64] | None:
-        """Interpolate the positions (J,) [rad] at a stamp [s]; None if a neighbouring line is more than 0.1 s away."""
+        """Interpolate the positions (J,) [rad] at a stamp [s]; None if a neighbouring line is more than 0.1 s away.
+
+        Before the first line and after the last one, positions are known for 0.02 s.
+        """
         return interpolate_joints(self.stamps, self.joints, stamp)
 
     def ordered(self, wanted: Sequence[str]) -> NDArray[np.float64]:
@@ -75,9 +79,18 @@ def joint_header(names: Iterable[str]) -> str:
     return " ".join((_HEADER, *names))
 
 
-def _names(line: str, count: int) -> tuple[str, ...]:
-    found = tuple(line.removeprefix(_HEADER).split()) if line.startswith(f"{_HEADER} ") else ()
-    return found if len(found) == count else ()
+def _names(path: Path, lines: list[str], count: int) -> tuple[str, ...]:
+    """Return the names of a line `# stamp NAME ...`, or none without such a line.
+
+    Raises:
+        LogError: there is another number of names than of columns.
+    """
+    header = next((line for line in lines if line.startswith(f"{_HEADER} ")), _HEADER)
+    found = tuple(header.removeprefix(_HEADER).split())
+    if len(found) not in (0, count):
+        hint = "name each joint after `# stamp`, or begin the comment with another word"
+        raise LogError(f"names {len(found)} of {count} columns.", file=path, field="# stamp", hint=hint)
+    return found
 
 
 class JointStates:
@@ -122,6 +135,9 @@ def select_joints(names: Sequence[str], positions: NDArray[np.float64], wanted: 
     Raises:
         InputError: a joint is missing.
     """
+    if len(names) not in (0, len(positions)):
+        hint = "give one position for each name"
+        raise InputError(f"has {len(positions)} positions and {len(names)} names.", field="joints", hint=hint)
     generic = not set(names) & set(wanted) and _are_numbers(names)
     if not len(names) or generic:
         if len(positions) < len(wanted):
@@ -142,7 +158,7 @@ def select_joints(names: Sequence[str], positions: NDArray[np.float64], wanted: 
 
 def _are_numbers(names: Sequence[str]) -> bool:
     """Return whether names are consecutive numbers from 0 or 1 after one of the usual words."""
-    found = [re.fullmatch(r"(q|j|joint)_?(\d+)", name) for name in names]
+    found = [re.fullmatch(r"(q|j|joint)_?(\d{1,3})", name) for name in names]
     numbers = [int(match[2]) for match in found if match is not None]
     return len(numbers) == len(names) > 0 and numbers in (list(range(len(names))), list(range(1, len(names) + 1)))
 
@@ -154,7 +170,8 @@ def interpolate_joints(
     after = int(np.searchsorted(stamps, stamp))
     near = slice(max(after - 1, 0), after + 1)
     gaps = np.abs(stamps[near] - stamp)
-    if gaps.min() > 0 and gaps.max() > MAX_GAP:
+    allowed = MAX_GAP if len(gaps) == 2 else HOLD
+    if gaps.min() > 0 and gaps.max() > allowed:
         return None
     return np.array([np.interp(stamp, stamps[near], column) for column in joints[near].T])
 

@@ -89,7 +89,8 @@ def _append_joints(path: Path, frame: Frame, names: tuple[str, ...]) -> None:
     """Append the positions of the named joints; a frame that lacks one of them gets no line."""
     assert frame.joints is not None
     values = dict(zip(frame.joint_names, frame.joints.tolist(), strict=True)) if frame.joint_names else {}
-    if set(names) - set(values):
+    if missing := set(names) - set(values):
+        _log.warning("frame %d is recorded without joints, because %s is missing", frame.index, ", ".join(missing))
         return
     known = [values[name] for name in names] if names else frame.joints.tolist()
     begins = bool(names) and not path.exists()

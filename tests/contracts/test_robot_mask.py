@@ -38,6 +38,7 @@ STATIC = {
 SCENE = Workspace(T_link_camera=T_BASE_STATIC_CAMERA, camera_link=0)
 NAMES = panda().chain.names
 STATES_HZ = 50.0
+LATE = 0.4  # [s]; within 0.1 s, the margins of mask and spheres hide the delay
 
 
 @contextmanager
@@ -67,7 +68,7 @@ def until(condition: Callable[[], Any], seconds: float = 120.0) -> None:
 def push_all(client: Client, map_id: str, log: WristLog, *, delay: float = 0.0) -> None:
     """Push frames without joints, each after the joint states around it, whose stamps are late."""
     for frame in log:
-        times = frame.stamp + np.arange(-2, 8) / STATES_HZ
+        times = frame.stamp + np.arange(-24, 8) / STATES_HZ
         client.report_joints("panda", times + delay, sweep(times), names=NAMES)
         client.push(map_id, replace(frame, joints=None))
     client.end(map_id)
@@ -79,8 +80,9 @@ def check_http(seconds: float) -> None:
         client = client_of(service)
         client.create_map("masked", robot=STATIC)
         push_all(client, "masked", log)
-        client.create_map("late", robot=STATIC | {"joint_delay": 0.1})
-        push_all(client, "late", log, delay=0.1)
+        for map_id, known in (("late", LATE), ("unknown", 0.0)):
+            client.create_map(map_id, robot=STATIC | {"joint_delay": known})
+            push_all(client, map_id, log, delay=LATE)
         client.create_map("own", robot=STATIC)
         client.create_map("bare")
         for map_id in ("own", "bare"):  # frames with joints of their own
@@ -92,6 +94,7 @@ def check_http(seconds: float) -> None:
         described = {m["id"]: m["robot"] for m in client.maps()}
     assert [counts[name] for name in ("masked", "late", "own")] == [0, 0, 0]
     assert counts["bare"] > 100
+    assert counts["unknown"] > 0
     assert described["bare"] is None
     assert described["late"] == {"name": "panda", "masked": len(log), "refused": 0, "problem": None}
 

@@ -49,12 +49,24 @@ def test_the_delay_is_found_within_its_own_uncertainty(log: WristLog) -> None:
     assert found.estimate.sigma < 0.01
 
 
+@pytest.mark.long
+def test_a_minute_of_motion_gives_the_same_delay() -> None:
+    found = estimate_joint_delay(Late(static_log(60.0, rate=10.0), 0.1), panda(), SCENE)
+    assert found.estimate.refusal == ""
+    assert abs(found.estimate.value - 0.1) < max(0.005, 2 * found.estimate.sigma)
+
+
+def test_frames_too_far_apart_determine_no_delay() -> None:
+    with pytest.raises(InputError, match="between frames"):
+        estimate_joint_delay(static_log(30.0, rate=1.0), panda(), SCENE)
+
+
 def test_a_camera_whose_place_is_wrong_and_an_arm_at_rest_determine_no_delay(log: WristLog) -> None:
     moved = T_BASE_STATIC_CAMERA.copy()
     moved[:3, 3] += [0.0, 0.4, 0.3]
     wrong = estimate_joint_delay(Late(log, 0.0), panda(), replace(SCENE, T_link_camera=moved))
     assert "overlap" in wrong.estimate.refusal
-    still = static_log(0.2, rate=100.0)
+    still = static_log(4.0, moves=False)
     assert estimate_joint_delay(still, panda(), SCENE).estimate.refusal
     with pytest.raises(InputError, match="static camera"):
         estimate_joint_delay(log, panda(), replace(SCENE, camera_link=-1))

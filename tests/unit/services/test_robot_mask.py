@@ -59,6 +59,9 @@ def test_states_of_a_gripper_are_left_out_and_broken_ones_are_refused() -> None:
     assert not known.add(JointState(1.05, ("finger",), np.array([0.02])))
     assert known.add(JointState(1.05, ("finger", "b", "a"), np.array([0.02, -1.05, 1.05])))
     np.testing.assert_allclose(known.at(1.05, 0.0), [1.05, -1.05])
+    assert not known.add(JointState(1.05, ("joint_0", "joint_1"), np.array([9.0, 9.0])))  # of a hand
+    assert not known.add(JointState(1.05, (), np.array([9.0, 9.0])))
+    np.testing.assert_allclose(known.at(1.05, 0.0), [1.05, -1.05])
     with pytest.raises(InputError, match="no joint b"):
         known.add(JointState(1.1, ("a",), np.array([1.0])))
     with pytest.raises(InputError, match="not finite"):
@@ -68,6 +71,14 @@ def test_states_of_a_gripper_are_left_out_and_broken_ones_are_refused() -> None:
 
 
 def test_a_clock_that_was_set_back_starts_over_and_memory_is_bounded() -> None:
+    back = history(100.0, 100.05)
+    back.add(JointState(95.0, NAMES, np.array([-1.0, 1.0])))  # by 5 s
+    with pytest.raises(JointsUnknownError):
+        back.at(100.02, 0.0)
+    assert back.at(95.0, 0.0)[0] == -1.0
+    back.clear()
+    with pytest.raises(JointsUnknownError, match="no joint state"):
+        back.at(95.0, 0.0)
     known = history(1e9, 1e9 + 0.01)
     for k in range(30_000):
         known.add(JointState(5.0 + k * 1e-4, NAMES, np.array([k, 0.0])))
@@ -102,6 +113,34 @@ def test_frames_without_known_joints_are_left_out_counted_and_reported(caplog: p
     assert (mask.masked, mask.refused) == (5, 5)
     assert [record.levelname for record in caplog.records] == ["WARNING"]
     assert "robot in them cannot be masked" in caplog.text
+
+
+def test_the_arm_is_masked_at_the_time_of_depth_too() -> None:
+    log = static_log(2.0)
+    plain = SelfMask(panda(), T_BASE_STATIC_CAMERA, link=0)
+    mask = RobotMask(panda(), SCENE)
+    for t in np.arange(0.0, 2.5, 0.02):
+        mask.history.add(JointState(t, panda().chain.names, sweep(np.array([t]))[0]))
+    frame, later = log[2], 0.4
+    live = mask(replace(frame, joints=None, depth_delay=later))
+    both = plain.usable(frame) & plain.usable(replace(frame, joints=sweep(np.array([frame.stamp + later]))[0]))
+    assert live.mask is not None
+    assert (live.mask != both).mean() < 2e-3
+    assert (both != plain.usable(frame)).mean() > 2e-3
+
+
+def test_a_recording_is_not_masked_by_live_states_and_ends_when_it_is_closed() -> None:
+    log = static_log(2.0)
+    mask = RobotMask(panda(), SCENE)
+    for t in np.arange(-1.0, 2.5, 0.02):
+        mask.history.add(JointState(t, panda().chain.names, sweep(np.array([t]))[0]))
+    recorded = [replace(frame, joints=None) for frame in log]
+    assert list(MaskedSource(recorded, mask)) == []
+    assert mask.refused == len(log)
+    source = MaskedSource(log, mask)
+    assert next(iter(source)).index == 0
+    source.close()
+    assert list(source) == []
 
 
 def test_a_camera_whose_place_is_unknown_is_refused_at_once() -> None:
