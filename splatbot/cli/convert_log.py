@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from splatbot.frame import Frame
     from splatbot.logs import Log
 
+_FINE = 5000.0  # [units/m] of logs whose own unit is coarser than a millimetre, as metres are
 _MCAP = ".mcap"
 
 
@@ -76,12 +77,15 @@ def convert_log(
 
 
 def _write(source: Log, out: Path, depth_scale: float | None, progress: Callable[[int], None]) -> None:
+    from splatbot.logs.base import MILLIMETRES
+
     if out.suffix.lower() == _MCAP:
         from splatbot.logs.mcap import record_mcap
 
         record_mcap(source, out, progress=progress)
     else:
-        _write_folder(source, out, depth_scale or source.calibration.depth_scale, progress)
+        own = source.calibration.depth_scale
+        _write_folder(source, out, depth_scale or (own if own >= MILLIMETRES else _FINE), progress)
 
 
 def _write_folder(source: Log, out: Path, depth_scale: float, progress: Callable[[int], None]) -> None:
@@ -105,3 +109,7 @@ def _write_folder(source: Log, out: Path, depth_scale: float, progress: Callable
         shutil.rmtree(draft, ignore_errors=True)
     if masked:
         print_message("warning", f"the masks of {masked} frames are not written; an .mcap file holds them")
+    if source.calibration.sensor:
+        print_message("warning", "the calibration of the sensor is not written; give it by --camera FILE")
+    if source.effects:
+        print_message("warning", "the account of simulated effects is not written")

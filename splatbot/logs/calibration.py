@@ -114,7 +114,7 @@ def read_object(path: str | Path) -> dict[str, Any]:
         values = json.loads(Path(path).read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise CameraError(f"cannot be read ({error.strerror}).", file=path, hint="check the path") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise CameraError(f"is not JSON ({error}).", file=path, hint="fix the JSON at the given position") from error
     if not isinstance(values, dict):
         raise CameraError("is no JSON object.", file=path, hint='write {"fx": ..., "fy": ..., ...}')
@@ -131,4 +131,10 @@ def number(path: str | Path, values: dict[str, Any], key: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
         problem = "is missing" if key not in values else f"is {value!r}, no number"
         raise CameraError(f"{problem}.", file=path, field=key, hint=f'add "{key}": a number')
-    return float(value)
+    try:
+        found = float(value)
+    except OverflowError:
+        found = math.inf
+    if not math.isfinite(found):
+        raise CameraError("is not finite.", file=path, field=key, hint=f'write "{key}": a number')
+    return found

@@ -5,6 +5,7 @@ Sources: Open3D, PinholeCameraIntrinsic and RGBDVideoMetadata; ScanNet, SensRead
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -23,7 +24,13 @@ from splatbot.logs.presets import find_calibration
 from splatbot.logs.registration import ColorRegistration
 
 _OPEN3D_NAMES = ("intrinsic.json", "camera_intrinsic.json")
-_COLOR, _DEPTH, _POSE = (rf"(?:.*\D)?(?P<n>\d+)\.(?:{suffixes})" for suffixes in ("jpe?g|png", "png|tiff?", "txt"))
+_COLOR, _DEPTH, _POSE = (
+    rf"(?:.*\D)?(?<!\d\.)(?P<n>\d+)\.(?:{suffixes})" for suffixes in ("jpe?g|png", "png|tiff?", "txt")
+)
+
+_CENTRE = 0.25, 0.75  # [1] of the image sides between which the principal point of a real camera lies
+
+_log = logging.getLogger(__name__)
 
 
 class ImageFolderLog(PairLog):
@@ -112,17 +119,32 @@ def _scannet_calibration(folder: Path, pairs: Sequence[ImagePair]) -> tuple[Cali
         scannet_camera(folder / f"intrinsic_{part}.txt", read_matrix(folder / f"intrinsic_{part}.txt"), size)
         for part, size in (("color", _size([p.color for p in pairs])), ("depth", _size([p.depth for p in pairs])))
     )
+    for part, camera in (("color", color), ("depth", depth)):
+        _check_centre(folder / f"intrinsic_{part}.txt", camera)
     places = [folder / f"extrinsic_{part}.txt" for part in ("color", "depth")]
     extrinsics = [read_matrix(path) if path.exists() else np.eye(4) for path in places]
     registration = ColorRegistration(color, depth, scannet_transform(folder, *extrinsics))
     return Calibration(depth, MILLIMETRES, str(folder / "intrinsic_depth.txt")), registration
 
 
+def _check_centre(source: Path, camera: Camera) -> None:
+    """Refuse intrinsics of another image size, as of images that were resized after ScanNet's export."""
+    low, high = _CENTRE
+    shares = (camera.cx + 0.5) / camera.width, (camera.cy + 0.5) / camera.height
+    if not all(low <= share <= high for share in shares):
+        problem = f"has its centre at {camera.cx:.0f}, {camera.cy:.0f} of images of {camera.width}x{camera.height} px"
+        hint = "give the intrinsics of this image size; ScanNet's are those of the images as recorded"
+        raise CameraError(f"{problem}.", file=source, field="intrinsics", hint=hint)
+
+
 def _size(paths: Sequence[Path]) -> tuple[int, int]:
     """Return the size of the first image that has a header."""
     for path in paths:
-        with path.open("rb") as file:
-            size = image_size(file)
+        try:
+            with path.open("rb") as file:
+                size = image_size(file)
+        except OSError:
+            continue  # an error of its frame
         if size is not None:
             return size
     raise LogError("is no PNG or JPEG.", file=paths[0], field="image size", hint="copy the images again")
@@ -151,4 +173,8 @@ def scannet_transform(source: Path, color: NDArray[np.floating], depth: NDArray[
     if T_color_sensor is None or T_depth_sensor is None:
         hint = "write a rotation and a translation [m]"
         raise CameraError("is not rigid.", file=source, field="extrinsic", hint=hint)
-    return T_color_sensor @ inverse(T_depth_sensor)
+    T_color_depth = T_color_sensor @ inverse(T_depth_sensor)
+    if not np.allclose(T_color_depth, np.eye(4), atol=1e-6):
+        distance = 1e3 * float(np.linalg.norm(T_color_depth[:3, 3]))
+        _log.warning("%s: colour and depth are %.0f mm apart; see Registration in docs/guide/logs.md", source, distance)
+    return T_color_depth

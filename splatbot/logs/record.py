@@ -62,7 +62,7 @@ def record(
     if truth is not None:
         truth.save(out / "groundtruth.txt")
     camera = None
-    names: tuple[str, ...] | None = None  # of the joints, from the first frame that has any
+    columns: tuple[tuple[str, ...], int] | None = None  # names and number of the joints in the first frame with any
     (out / "depth.txt").unlink(missing_ok=True)  # of a recording that was cut off before its first colour image
     with _LineFile(out / "depth.txt") as depths, _LineFile(out / "rgb.txt") as colors:
         for number, frame in enumerate(frames):
@@ -73,8 +73,10 @@ def record(
                 raise LogError("the camera changed.", file=frame.source, field="camera", hint="record two logs")
             name = f"{number:06d}.png"
             if frame.joints is not None:
-                names = frame.joint_names if names is None else names
-                _append_joints(out / JOINTS, frame, names)
+                if columns is None:
+                    columns = frame.joint_names, len(frame.joints)
+                    _check_names(frame)
+                _append_joints(out / JOINTS, frame, *columns)
             _write_png(out / "rgb" / name, cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2BGR))
             _write_png(out / "depth" / name, _to_units(frame, depth_scale))
             # Depth first: a depth image without colour is harmless, but colour without depth is an error.
@@ -85,12 +87,20 @@ def record(
     return out
 
 
-def _append_joints(path: Path, frame: Frame, names: tuple[str, ...]) -> None:
-    """Append the positions of the named joints; a frame that lacks one of them gets no line."""
+def _check_names(frame: Frame) -> None:
+    for name in frame.joint_names:
+        if not name or name.split() != [name]:
+            hint = "joints.txt separates names by spaces; record an .mcap file"
+            raise LogError(f"has a joint {name!r}.", file=frame.source, field="joint_names", hint=hint)
+
+
+def _append_joints(path: Path, frame: Frame, names: tuple[str, ...], count: int) -> None:
+    """Append the positions of the first frame's joints; a frame that lacks one of them gets no line."""
     assert frame.joints is not None
     values = dict(zip(frame.joint_names, frame.joints.tolist(), strict=True)) if frame.joint_names else {}
-    if missing := set(names) - set(values):
-        _log.warning("frame %d is recorded without joints, because %s is missing", frame.index, ", ".join(missing))
+    missing = ", ".join(sorted(set(names) - set(values)))
+    if missing or (not names and (frame.joint_names or len(frame.joints) != count)):
+        _log.warning("frame %d is recorded without joints: %s", frame.index, f"no {missing}" if missing else "others")
         return
     known = [values[name] for name in names] if names else frame.joints.tolist()
     begins = bool(names) and not path.exists()

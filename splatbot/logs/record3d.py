@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import lzma
 import re
+import struct
 import zipfile
 import zlib
 from functools import cached_property
@@ -31,8 +33,16 @@ from splatbot.trajectory import Trajectory
 _METADATA = "metadata"
 _MAX_METADATA = 2**26  # bytes
 _SPARE = 2**16  # bytes that a compressed image may be larger than its pixels
-_DEPTH_SIZES = ((192, 256), (256, 192), (720, 960))  # of LiDAR and of the front camera, where metadata lack dw, dh
+_DEPTH_SIZES = (
+    (192, 256),
+    (256, 192),
+    (480, 640),
+    (640, 480),
+    (720, 960),
+    (960, 720),
+)  # of LiDAR and of the front camera, where metadata lack dw, dh
 _FLIP_YZ = np.diag([1.0, -1.0, -1.0, 1.0])  # ARKit: y up, z backwards
+_DAMAGED = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error)
 _AGAIN = "share the recording again from Record3D"
 
 
@@ -56,7 +66,7 @@ class Record3dLog(ReaderLog, StampedLog):
         require_lzfse(self.path)
         try:
             self._zip = zipfile.ZipFile(self.path)
-        except (OSError, zipfile.BadZipFile, NotImplementedError) as error:
+        except (OSError, ValueError, zipfile.BadZipFile, NotImplementedError) as error:
             raise self._bad("file", f"is no ZIP file that can be read ({error})", _AGAIN) from error
         self._values = self._read_metadata()
         colors, depths = self._numbers("jpg"), self._numbers("depth")
@@ -198,7 +208,7 @@ class Record3dLog(ReaderLog, StampedLog):
         try:
             with self._zip.open(name) as file:
                 data = file.read(limit + 1)
-        except (KeyError, OSError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
+        except (*_DAMAGED, KeyError, OSError, EOFError, RuntimeError, ValueError) as error:
             raise LogError(f"cannot be read ({error}).", file=source, field=name, hint=_AGAIN) from error
         if len(data) > limit:
             raise LogError(f"has more than {limit} bytes.", file=source, field=name, hint=_AGAIN)

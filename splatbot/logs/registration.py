@@ -10,7 +10,7 @@ from splatbot.camera import Camera
 from splatbot.errors import CameraError, LogError
 
 _MAX_SIDE = 16_384  # [px] of an image; OpenCV cannot resample sides above 32767
-_MAX_PIXELS = 2**26
+_MAX_PIXELS = 2**24
 
 
 class ColorRegistration:
@@ -34,7 +34,7 @@ class ColorRegistration:
         for camera in (color, depth):
             if max(camera.width, camera.height) > _MAX_SIDE or camera.width * camera.height > _MAX_PIXELS:
                 raise CameraError(
-                    f"is {camera.width}x{camera.height}.", field="image size", hint="give images of up to 64 megapixels"
+                    f"is {camera.width}x{camera.height}.", field="image size", hint="give images of up to 16 megapixels"
                 )
         T = np.eye(4) if T_color_depth is None else np.asarray(T_color_depth, np.float64)
         self.color_size, self.depth_size = (color.width, color.height), (depth.width, depth.height)

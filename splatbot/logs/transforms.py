@@ -25,6 +25,7 @@ NAME = "transforms.json"
 
 _FLIP_YZ = np.diag([1.0, -1.0, -1.0, 1.0])
 _KEYS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
+_MODEL = ("camera_model", "is_fisheye", "k4")
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
 
 
@@ -87,22 +88,26 @@ class TransformsLog(PairLog):
         return T
 
     def _calibration(self, values: dict[str, Any], frames: list[dict[str, Any]]) -> Calibration:
-        keys = (*_KEYS, *_COEFFICIENTS)
+        keys = (*_KEYS, *_COEFFICIENTS, *_MODEL)
         cameras = [{key: {**values, **frame}.get(key) for key in keys} for frame in frames]
         if any(camera != cameras[0] for camera in cameras):
             hint = "a log has one camera: undistort the images to one, or name it by --camera FILE"
             raise CameraError("differ between frames.", file=self._file, field="intrinsics", hint=hint)
-        if values.get("camera_model", "OPENCV") not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE"):
+        model, fisheye, k4 = (cameras[0][key] for key in _MODEL)
+        if model not in (None, "OPENCV", "PINHOLE", "SIMPLE_PINHOLE") or fisheye or k4:
             hint = "undistort the images, or name their camera by --camera FILE"
-            raise CameraError(f"is {values['camera_model']!r}.", file=self._file, field="camera_model", hint=hint)
+            lens = f"is {model!r:.80}, is_fisheye {fisheye!r:.20}, k4 {k4!r:.20}"
+            raise CameraError(f"{lens}.", file=self._file, field="camera_model", hint=hint)
         fx, fy, cx, cy, width, height = (number(self._file, cameras[0], key) for key in _KEYS)
-        lens = tuple(number(self._file, {"k": cameras[0][key] or 0}, "k") for key in _COEFFICIENTS)
+        distortion = tuple(number(self._file, {"k": cameras[0][key] or 0}, "k") for key in _COEFFICIENTS)
         unit = number(self._file, {"depth_unit_scale_factor": 1 / MILLIMETRES, **values}, "depth_unit_scale_factor")
         if not 1e-9 < unit < 1e9:
             hint = "give metres per unit: 0.001 for millimetres"
             raise CameraError(f"is {unit:g}.", file=self._file, field="depth_unit_scale_factor", hint=hint)
         try:
-            camera = Camera(fx, fy, cx - 0.5, cy - 0.5, round(width), round(height), lens if any(lens) else ())
+            camera = Camera(
+                fx, fy, cx - 0.5, cy - 0.5, round(width), round(height), distortion if any(distortion) else ()
+            )
         except CameraError as error:
             raise CameraError(error.message, file=self._file, field=error.field, hint=error.hint) from error
         except (ValueError, OverflowError) as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import cv2
@@ -116,3 +117,16 @@ def test_masks_that_a_folder_does_not_hold_are_named(run: RunCommand, tmp_path: 
     answer = run("convert-log", tmp_path / "log", tmp_path / "copy")
     assert answer.code == 0
     assert "warning: the masks of 4 frames are not written" in answer.err
+
+
+def test_depth_in_metres_is_written_in_a_finer_unit(run: RunCommand, tmp_path: Path, frames: list[Frame]) -> None:
+    folder = write_tum(tmp_path / "metres", frames, [])
+    values = json.loads((folder / "intrinsics.json").read_text())
+    (folder / "intrinsics.json").write_text(json.dumps(values | {"depth_scale": 1.0}))
+    for k, path in enumerate(sorted((folder / "depth").iterdir())):
+        cv2.imwrite(str(path.with_suffix(".tiff")), frames[k].depth)
+    listed = (folder / "depth.txt").read_text()
+    (folder / "depth.txt").write_text(listed.replace(".png", ".tiff"))
+    assert run("convert-log", folder, tmp_path / "fine").code == 0
+    for a, b in zip(frames, open_log(tmp_path / "fine"), strict=True):
+        np.testing.assert_allclose(b.depth, a.depth, atol=1.1e-4)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from splatbot.errors import CameraError, InputError, LogError
 from splatbot.frame import Frame
 from splatbot.geometry import se3_exp, transform_points
 from splatbot.logs import open_log
-from splatbot.logs.image_folder import ImageFolderLog
+from splatbot.logs.image_folder import _COLOR, ImageFolderLog, _check_centre
 from tests.unit.logs.published import Pose, encoded, text, write, write_open3d, write_scannet_export
 
 Scene = tuple[list[Frame], list[Pose]]
@@ -176,3 +177,15 @@ def test_one_damaged_image_spoils_its_frame_alone(scannet_folder: Path) -> None:
     with pytest.raises(LogError, match="colour size: is 80x60"):
         log.read(1)
     assert log.read(2).index == 2
+
+
+def test_names_that_are_stamps_are_no_numbers(tmp_path: Path) -> None:
+    names = [re.fullmatch(_COLOR, name) for name in ("1305031101.900000.png", "7.jpg", "frame-000012.png", "a.12.png")]
+    assert [match and match["n"] for match in names] == [None, "7", "000012", "12"]
+
+
+def test_intrinsics_of_another_image_size_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "intrinsic_color.txt"
+    _check_centre(path, Camera(1170.0, 1170.0, 647.75, 483.75, 1296, 968))
+    with pytest.raises(CameraError, match="centre at 648, 484 of images of 640x480"):
+        _check_centre(path, Camera(1170.0, 1170.0, 647.75, 483.75, 640, 480))
