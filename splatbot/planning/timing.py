@@ -52,6 +52,7 @@ class TimingConstants:
 
 
 CONSTANTS = TimingConstants()
+_BLOCK = 4096  # samples of a curve at a time
 
 DEFAULT_SPEED = 0.2
 """Fraction of the limits of velocity and acceleration at which commands and services move an arm."""
@@ -190,7 +191,8 @@ def _sampled(curve: Curve, chain: KinematicChain, step: float) -> tuple[Array, N
     elapsed = t - time[i]
     gain = np.where(duration > 0, (speed[1:] - speed[:-1]) / np.maximum(duration, 1e-12), 0.0)[i]
     at = np.clip(s[i] + speed[i] * elapsed + 0.5 * gain * elapsed**2, s[i], s[i + 1])
-    return curve.at(at)[0], curve.corner[curve.piece_of(at)]
+    parts = np.array_split(at, -(-len(at) // _BLOCK))  # the derivatives of a long motion take 150 MB at once
+    return np.concatenate([curve.at(part)[0] for part in parts]), curve.corner[curve.piece_of(at)]
 
 
 def _shorten(reach: Array, timed: _TimedSpline, failed: NDArray[np.bool_]) -> bool:
