@@ -62,7 +62,7 @@ def open_without_robot(uri: str, robot: str | None, *, camera: str | None = None
     """
     if robot is None:
         return open_log(uri, camera=camera)
-    workspace = find_workspace(uri.partition("?")[0])
+    workspace = find_workspace(uri)
     mask = self_mask(load_robot(robot), workspace, file=f"{uri}/{NAME}")
     assert workspace is not None
     return MaskedLog(open_log(uri, camera=camera, joint_delay=workspace.joint_delay), mask)

@@ -22,7 +22,6 @@ Mode = Literal["rgb", "depth", "normal", "alpha"]
 
 MOST_MARGIN_M = 10.0  # larger than any arm
 MAX_JOINTS = 64
-MAX_STATES = 1000
 
 
 class Request(BaseModel):
@@ -131,12 +130,6 @@ class RobotInView(Request):
             given["joint_offsets"] = np.array(self.joint_offsets)
         given["joint_names"] = tuple(given.get("joint_names", known.joint_names if known is not None else ()))
         return replace(known or Workspace(), **given)
-
-
-class JointStatesTaken(BaseModel):
-    """Use of reported joint states."""
-
-    masks: int = Field(description="masks of maps that use them; 0: the robot is masked in no map")
 
 
 class RobotMaskInfo(BaseModel):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -187,13 +188,16 @@ class Workspace:
 def find_workspace(*places: str | Path | None) -> Workspace | None:
     """Return the first ``scene.yaml`` in the given folders or next to the given files, or None.
 
+    A place may be the address of a log: options after a question mark are left out.
+
     Raises:
         FormatError: the file is damaged.
     """
     for place in places:
         if place is None:
             continue
-        path = Path(place)
+        known = os.path.exists(place)  # noqa: PTH110 - Path.exists() raises if the options are too long for a name
+        path = Path(place if known else str(place).partition("?")[0])
         file = (path.parent if path.suffix and not path.is_dir() else path) / NAME
         if file.is_file():
             return Workspace.load(file)

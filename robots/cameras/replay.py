@@ -89,7 +89,7 @@ class ReplayCamera:
         self._log = log
         self._number, self._offset = 0, 0.0  # of the next frame, and [s] from the log's clock to the camera's
         self._gone_until: float | None = None  # [s] of the monotonic clock, while unplugged
-        self._for_good = False
+        self._closed_by_user = False
         self._queue: deque[Frame | BaseException | object] = deque()
         self._changed = threading.Condition()
         self._closed = threading.Event()
@@ -120,7 +120,7 @@ class ReplayCamera:
 
     def close(self) -> None:
         """End the stream; a waiting reader receives no further frame."""
-        self._for_good = True
+        self._closed_by_user = True
         self._end()
 
     def _end(self) -> None:
@@ -129,7 +129,7 @@ class ReplayCamera:
             self._changed.notify_all()
 
     def __iter__(self) -> Iterator[Frame]:
-        if self._for_good:
+        if self._closed_by_user:
             return
         if self._gone_until is not None:
             if time.monotonic() < self._gone_until:
@@ -181,7 +181,7 @@ class ReplayCamera:
         begun: tuple[float, float] | None = None
         while True:
             period = last = 0.0
-            for index in range(number % len(self._log), len(self._log)):
+            for index in range(number % len(self._log) if self.options.loop else number, len(self._log)):
                 frame = self._log.read(index)
                 stamp = frame.stamp + offset
                 begun = begun or (time.monotonic(), stamp)

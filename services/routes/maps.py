@@ -169,12 +169,12 @@ async def upload_map(
 @router.get("/{map_id}", responses=example(_EXAMPLE) | problems(404))
 def get_map(served: Served, request: Request, response: Response) -> Any:
     """Describe a map; `state` and `detail` report the progress of mapping."""
-    robot = None if served.mask is None else _masked(served.mask)
-    tag = etag(served, f"{served.detail} {robot}")
+    info = _info(served)
+    tag = etag(served, f"{info.detail} {info.robot}")
     if (kept := unchanged(request, served, tag)) is not None:
         return kept
     response.headers.update(version_headers(served, tag))
-    return _info(served)
+    return info
 
 
 @router.delete("/{map_id}", status_code=204, responses=problems(404))

@@ -6,18 +6,20 @@ from typing import Annotated
 
 import numpy as np
 from fastapi import APIRouter, Depends, Path, Response
-from pydantic import Field
+from pydantic import BaseModel, Field
 
 from splatbot.errors import InputError
 from splatbot.services.arms import known_robot
 from splatbot.services.codecs import body_of, request_body
 from splatbot.services.dependencies import Served, Service, example, problems
 from splatbot.services.robot_mask import MAX_HELD
-from splatbot.services.schemas import MAX_JOINTS, MAX_STATES, JointStatesTaken, Vector4
+from splatbot.services.schemas import MAX_JOINTS, Vector4
 from splatbot.services.schemas import Request as Body
 from splatbot.services.topics import JointState
 
 router = APIRouter(tags=["robots"])
+
+_MAX_STATES = 1000  # of a request
 
 
 class JointStateIn(Body):
@@ -31,7 +33,13 @@ class JointStateIn(Body):
 class JointStatesRequest(Body):
     """Joint states of a robot; send them at 10 Hz or more, while frames are pushed."""
 
-    states: list[JointStateIn] = Field(min_length=1, max_length=MAX_STATES, description="in any order")
+    states: list[JointStateIn] = Field(min_length=1, max_length=_MAX_STATES, description="in any order")
+
+
+class JointStatesTaken(BaseModel):
+    """Use of reported joint states."""
+
+    masks: int = Field(description="masks of maps that use them; 0: the robot is masked in no map")
 
 
 class HeldRequest(Body):

@@ -51,7 +51,7 @@ def calibrate_joint_delay_command(
     check_camera(camera)
     check_file(scene, "--scene")
     check_output(out, folder=False)
-    workspace = Workspace.load(scene) if scene is not None else find_workspace(log.partition("?")[0]) or Workspace()
+    workspace = Workspace.load(scene) if scene is not None else find_workspace(log) or Workspace()
     arm, recording = load_robot(robot), open_log(log, camera=camera)
     with shares(quiet) as show:
         found = estimate_joint_delay(recording, arm, workspace, on_share=lambda share: show("delay", share))

@@ -49,7 +49,8 @@ def convert_log(
         out: the folder or the .mcap file to write; must not exist.
         frames: write only the first N frames.
         camera: intrinsics instead of the log's own, as for `splatbot map`.
-        depth_scale: units per metre of depth in a folder; by default those of the log.
+        depth_scale: units per metre of depth in a folder; by default those of the log, or 5000 if these are below
+            1000.
         quiet: no progress, no summary, only errors.
     """
     log_kind(log)

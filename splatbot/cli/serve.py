@@ -149,7 +149,7 @@ def _follow(runtime: Runtime, log: str, open_source: Callable[[float], Log | Fra
     from splatbot.services.mapping import workspace_of
     from splatbot.slam import Slam
 
-    workspace = runtime.workspace or workspace_of(log.partition("?")[0], None)
+    workspace = runtime.workspace or workspace_of(log, None)
     mask = runtime.new_mask(workspace)
     source = open_source(0.0 if mask is None else mask.joint_delay)
     served = runtime.store.add(MAP_ID, source=source.name, state="mapping", workspace=workspace, mask=mask)

@@ -10,7 +10,7 @@ import pytest
 from splatbot.errors import FormatError, InputError
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import transform_points
-from splatbot.workspace import NamedPlace, Workspace, find_workspace, fit_workspace
+from splatbot.workspace import NAME, NamedPlace, Workspace, find_workspace, fit_workspace
 
 
 def _table(seed: int = 0) -> tuple[GaussianModel, np.ndarray]:
@@ -129,3 +129,13 @@ def test_things_without_name_or_place_are_refused(text: str, tmp_path: Path) -> 
     (tmp_path / "scene.yaml").write_text(f"objects: {text}\n")
     with pytest.raises(FormatError, match="objects"):
         Workspace.load(tmp_path / "scene.yaml")
+
+
+def test_the_scene_of_a_log_is_found_by_its_address_with_options(tmp_path: Path) -> None:
+    Workspace(camera_link=0, T_link_camera=np.eye(4), joint_delay=0.05).save(tmp_path / NAME)
+    (tmp_path / "a.mcap").touch()
+    for address in (f"{tmp_path}/a.mcap?color=/wrist/image_raw", f"{tmp_path}?tolerance=0.05", tmp_path):
+        found = find_workspace(address)
+        assert found is not None
+        assert found.joint_delay == 0.05
+    assert find_workspace("synthetic:tabletop?" + "effects=a;" * 1000) is None

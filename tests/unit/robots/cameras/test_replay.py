@@ -105,3 +105,16 @@ def test_a_camera_of_another_kind_is_refused() -> None:
 def test_the_log_keeps_the_options_that_are_its_own() -> None:
     camera = open_camera("replay:synthetic:tabletop?frames=2&speed=50&width=64&height=48")
     assert [frame.rgb.shape for frame in camera] == [(48, 64, 3)] * 2
+
+
+def test_a_camera_that_comes_back_goes_on_and_one_unplugged_at_its_last_frame_ends(make_log: MakeLog) -> None:
+    log = open_log(make_log(5))
+    for unplug, later in ((2, [3, 4]), (4, [])):
+        camera = ReplayCamera(log, ReplayOptions(speed=100, unplug=unplug, replug_s=0.05))
+        frames = iter(camera)
+        with pytest.raises(DeviceError):
+            list(frames)
+        time.sleep(0.06)
+        back = list(camera)
+        assert [frame.index for frame in back] == later
+        assert [frame.stamp for frame in back] == pytest.approx([log[k].stamp + 0.05 for k in later])
