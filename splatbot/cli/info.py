@@ -105,17 +105,30 @@ def _print_streams(streams: Sequence[Stream], title: str) -> None:
     from splatbot.results.units import NONE
 
     table = Table(title=title, title_justify="left")
-    for name in ("stream", "kind"):
-        table.add_column(name)
-    for name in ("messages", "rate", "missing", "repeated", "unordered", "clock"):
-        table.add_column(name, justify="right")
-    table.add_column("first")
-    for s in streams:
-        rate = NONE if s.rate is None else f"{s.rate:.1f} Hz"
-        clock = NONE if s.clock_offset is None else _clock(s.clock_offset)
-        counts = (str(n) for n in (s.dropped, s.duplicates, s.out_of_order))
-        table.add_row(s.name, s.kind, str(s.count), rate, *counts, clock, s.note)
+    columns = {
+        "stream": [_printable(s.name) for s in streams],
+        "kind": [_printable(s.kind) for s in streams],
+        "messages": [str(s.count) for s in streams],
+        "rate": [NONE if s.rate is None else f"{s.rate:.1f} Hz" for s in streams],
+        "missing": [str(s.dropped) for s in streams],
+        "repeated": [str(s.duplicates) for s in streams],
+        "unordered": [str(s.out_of_order) for s in streams],
+        "clock": [NONE if s.clock_offset is None else _clock(s.clock_offset) for s in streams],
+        "first": [_printable(s.note) for s in streams],
+    }
+    shown = {name: values for name, values in columns.items() if set(values) - {"", NONE}}
+    for name in shown:
+        table.add_column(name, justify="left" if name in ("stream", "kind", "first") else "right")
+    for row in zip(*shown.values(), strict=True):
+        table.add_row(*row)
     print_columns(table)
+
+
+def _printable(text: str) -> str:
+    """Return a text of a recording without control characters and markup, which a terminal would obey."""
+    from rich.markup import escape
+
+    return escape("".join(letter if letter.isprintable() else "?" for letter in text))
 
 
 def _clock(offset: float) -> str:

@@ -51,16 +51,16 @@ def print_columns(table: Table, console: Console | None = None) -> None:
         console.print(table)
         return
     if table.title:
-        console.print(f"[italic]{table.title}[/italic]")
+        console.print(f"[italic]{table.title}[/italic]", highlight=False)
     names = [str(column.header) for column in table.columns]
     cells = [list(column.cells) for column in table.columns]
     for number in range(table.row_count):
         values = [str(column[number]) for column in cells]
-        console.print(f"[bold]{' '.join(part for part in (names[0], values[0]) if part)}[/bold]")
+        console.print(f"[bold]{' '.join(part for part in (names[0], values[0]) if part)}[/bold]", highlight=False)
         width = max((len(name) for name in names[1:]), default=0)
         for name, value in zip(names[1:], values[1:], strict=True):
             if value:
-                console.print(f"  {name:<{width}}  {value}")
+                console.print(f"  {name:<{width}}  {value}", highlight=False)
 
 
 def _natural_width(table: Table) -> int:

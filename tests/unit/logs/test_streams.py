@@ -14,6 +14,7 @@ from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from splatbot.cli import main
+from splatbot.cli.info import _printable
 from splatbot.errors import LogError
 from splatbot.logs import open_log
 from splatbot.logs.record import record
@@ -99,6 +100,10 @@ def test_every_topic_of_a_recording_is_described(recording: Path, capsys: pytest
     told = capsys.readouterr()
     assert "base > tool" in told.out
     assert "no depth images" in told.err
+
+
+def test_texts_of_a_recording_neither_move_the_cursor_nor_are_markup() -> None:
+    assert _printable("[red]a\x1b[2Jb\n") == "\\[red]a?[2Jb?"
 
 
 def test_a_damaged_recording_is_an_error(tmp_path: Path) -> None:
