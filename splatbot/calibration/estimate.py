@@ -21,6 +21,11 @@ class Estimate:
     unit: str
     refusal: str = ""
 
+    @property
+    def significant(self) -> float:
+        """The value, or 0 if 0 is within two standard deviations of it."""
+        return self.value if abs(self.value) > 2.0 * self.sigma else 0.0
+
     @classmethod
     def limited(cls, value: float, sigma: float, unit: str, largest_sigma: float, need: str) -> Estimate:
         """Return the estimate, refused if its standard deviation exceeds ``largest_sigma``.

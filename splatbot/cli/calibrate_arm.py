@@ -361,4 +361,4 @@ def _joint_delay(found: HandEyeCalibration, known_before: float) -> float:
 
     delay = found.delay
     known = delay is not None and not delay.refusal and abs(delay.value) <= MAX_JOINT_DELAY_S
-    return delay.value if known and delay is not None else known_before
+    return delay.significant if known and delay is not None else known_before

@@ -66,7 +66,7 @@ def calibrate_joint_delay_command(
             f"does not determine the delay: {found.estimate.refusal}.", file=log, field="joints", hint="see --help"
         )
     if out is not None:
-        replace(workspace, joint_delay=found.estimate.value).save(out)
+        replace(workspace, joint_delay=found.estimate.significant).save(out)
         if not quiet:
-            print(f"written: {out}")
+            print(f"written: {out}" + ("" if found.estimate.significant else ", without a delay: 0 is within 2 sigma"))
     return 0

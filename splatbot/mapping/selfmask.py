@@ -97,7 +97,7 @@ class SelfMask:
         """
         where = frame.source or f"frame {frame.index}"
         if frame.joints is None:
-            hint = f"record the joints of {self._arm.robot.name} with the frames, or map without its mask"
+            hint = f"record the joints of {self._arm.robot.name} at 10 Hz or more, or map without its mask"
             raise JointsUnknownError("has no joints at its time.", file=where, field="joints", hint=hint)
         try:
             q = select_joints(frame.joint_names, frame.joints, self._names) + self._offsets

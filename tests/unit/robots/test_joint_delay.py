@@ -89,6 +89,11 @@ def test_the_command_writes_the_delay_that_masks_read(
     assert saved.joint_delay == pytest.approx(0.1, abs=0.01)
     assert saved.T_link_camera is not None
     np.testing.assert_allclose(saved.T_link_camera, T_BASE_STATIC_CAMERA, atol=1e-5)
+    plain = record(log, tmp_path / "plain")
+    SCENE.save(plain / "scene.yaml")
+    assert main(["calibrate", "joint-delay", str(plain), "--robot", "panda", "--out", str(plain / "scene.yaml")]) == 0
+    assert "without a delay" in capsys.readouterr().out
+    assert Workspace.load(plain / "scene.yaml").joint_delay == 0.0
     (folder / "scene.yaml").unlink()
     assert main(["calibrate", "joint-delay", str(folder), "--robot", "panda", "--quiet"]) == 2
     assert "T_link_camera" in capsys.readouterr().err
