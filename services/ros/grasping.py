@@ -69,7 +69,7 @@ def _hint(args: Mapping[str, Any]) -> Hint:
 
 def _grasp_message(number: int, grasp: Grasp, robot: RobotModel, stamp: float) -> dict[str, Any]:
     """Return a moveit_msgs/Grasp; the tool's z axis is the approach."""
-    approach, distance = grasp.T_world_tcp[:3, 2], _apart(grasp)
+    approach, distance = grasp.T_world_tcp[:3, 2], grasp.approach_length
     approach_distance = {"desired_distance": distance, "min_distance": 0.5 * distance}
     there = to_plain(header(stamp, MAP_FRAME))
     posture = None if grasp.q is None else {"name": list(robot.chain.names), "position": np.asarray(grasp.q)}
@@ -85,10 +85,6 @@ def _grasp_message(number: int, grasp: Grasp, robot: RobotModel, stamp: float) -
         "allowed_touch_objects": [],
         "joint_state": posture,  # not of moveit_msgs/Grasp: the arm's joints there
     }
-
-
-def _apart(grasp: Grasp) -> float:
-    return float(np.linalg.norm(grasp.T_world_tcp[:3, 3] - grasp.T_world_pregrasp[:3, 3]))
 
 
 def _fingers(opening: float) -> dict[str, Any]:

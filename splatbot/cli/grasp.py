@@ -89,7 +89,7 @@ def grasp(
         friction: friction coefficient between finger pads and object.
         samples: sampled surface points, which determine the time. Without a result, four times as many are tried.
         wanted: largest number of grasps.
-        pregrasp: length of the straight approach [m].
+        pregrasp: shortest straight approach [m]. It is longer where no plan may end at its start, up to 0.3 m.
         margin: clearance [m] of hand and arm to the rest of the map. "auto", the default with a run, is the audited
             error of the map around the target, for the arm alone: the hand has to come close, and is checked against
             raw depth.

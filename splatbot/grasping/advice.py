@@ -45,7 +45,7 @@ _CHANGES = (
     (
         "where no plan may end",
         "its pre-grasps are too near the map or in unknown space",
-        "start nearer (a smaller --pregrasp), map the place from more sides, or let unknown space be free",
+        "map the place from more sides, let unknown space be free, or start nearer (a smaller --pregrasp)",
     ),
     (
         "into unknown space",

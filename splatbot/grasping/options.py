@@ -28,7 +28,8 @@ class GraspOptions:
             found, the search is repeated once with four times as many seeds and sharper edges.
         rolls: number of approach directions around the closing axis of each contact pair.
         depths: number of distances from the finger tips at which the contacts are placed.
-        pregrasp: length of the straight approach from the pre-grasp to the grasp [m].
+        pregrasp: shortest length of the straight approach from the pre-grasp to the grasp [m]. It is longer, up to
+            0.3 m, where no plan may end at that pre-grasp.
         wanted: maximum number of grasps to return.
         approach: "any", "top" or "side".
         min_confidence: least confidence 0..1 of a grasp that is offered.

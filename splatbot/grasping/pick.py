@@ -228,7 +228,7 @@ class _Pick:
         if not found.still:
             self._done(f"moved by {1e3 * found.shift:.1f} mm, {np.degrees(found.turn):.1f} degrees; {agrees}")
             plan = self._adjusted(plan, found.T_now_before)
-        retreat = float(np.linalg.norm(plan.grasp.T_world_tcp[:3, 3] - plan.grasp.T_world_pregrasp[:3, 3]))
+        retreat = plan.grasp.approach_length
         hand = Hands.one(plan.grasp.T_world_tcp, plan.opening)
         deep = in_the_way(hand, self.s.hand, view, retreat)
         if deep > LOOK.max_penetration:

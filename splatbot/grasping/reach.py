@@ -8,11 +8,12 @@ from functools import cache
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.errors import InputError
 from splatbot.grasping.hands import CONSTANTS as HANDS
-from splatbot.planning.cartesian import straight_line
+from splatbot.planning.cartesian import along, straight_line
 from splatbot.planning.goals import goal_configurations
 from splatbot.planning.problem import PlanStatus, PoseGoal
 from splatbot.protocols import Array, HandShape, HasHand, RobotKinematics
@@ -24,10 +25,12 @@ class ReachConstants:
 
     Args:
         max_solutions: IK solutions of a grasp whose approach is tried.
+        max_retreat: [m] longest straight approach from a pre-grasp that was moved back, since no plan may end nearer.
         full_score_clearance: [m] clearance of the arm with the score 1.
     """
 
     max_solutions: int = 4
+    max_retreat: float = 0.3
     full_score_clearance: float = 0.03
 
 
@@ -41,6 +44,8 @@ class Reached:
     Args:
         q: (J,) joint positions at the grasp. If None, the arm does not reach it.
         path: (K, J) path from the pre-grasp to the grasp.
+        T_world_pregrasp: (4, 4) pose of the tool at its start, which is farther back than requested where no plan may end
+            there.
         clearance: minimum clearance of the arm along the path [m].
         limits: minimum distance to a joint limit as a fraction of half the joint's range, 0..1.
         reason: reason for which the grasp is not reachable; empty if it is.
@@ -53,6 +58,7 @@ class Reached:
     limits: float
     reason: str = ""
     kind: str = ""
+    T_world_pregrasp: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +115,7 @@ class ReachabilityCheck(Protocol):
 
         Args:
             T_world_tcp: (4, 4) pose of the tool at the grasp.
-            T_world_pregrasp: (4, 4) pose of the tool at the start of the approach.
+            T_world_pregrasp: (4, 4) pose of the tool at the start of the shortest approach.
             opening: finger opening during the approach [m].
             width: finger opening at the closed grasp [m].
         """
@@ -202,24 +208,42 @@ class ArmReach:
             if not back or back.path is None:
                 reason, kind = f"its approach is blocked: {back.reason.rstrip('.')}", "have a blocked approach"
                 continue
-            start = back.path.waypoints[-1]
-            if self.whole is not None and arm.check(self.whole, start[None]).in_collision[0]:
+            away, clearance, T_start = back.path.waypoints, back.path.certificate.clearance, T_world_pregrasp
+            if self.whole is not None and arm.check(self.whole, away[-1:]).in_collision[0]:
                 reason, kind = "the arm touches the target before it approaches", "have a blocked approach"
                 continue
-            if self.departure is not None and self._open.check(self.departure, start[None]).in_collision[0]:
-                reason, kind = "no plan may end at its pre-grasp", "start where no plan may end"
-                continue
+            if not self._plan_may_end(away[-1:])[0]:
+                farther = straight_line(arm, self.around, away[-1], self._farthest(T_world_tcp, T_world_pregrasp))
+                beyond = away[:0] if farther.path is None else farther.path.waypoints[1:]
+                ends = np.flatnonzero(self._plan_may_end(beyond))
+                if farther.path is None or not len(ends):
+                    reason, kind = "no plan may end at its pre-grasp", "start where no plan may end"
+                    continue
+                away = np.concatenate([away, beyond[: ends[0] + 1]])
+                clearance = min(clearance, farther.path.certificate.clearance)
+                link = arm.forward(away[[0, -1]])[:, -1, :3, 3]  # without rotation, the tool moves as its link does
+                T_start = along(T_world_tcp, -float(np.linalg.norm(link[1] - link[0])))
             if closed.check(self.around_held, q[None]).in_collision[0]:
                 reason, kind = "the closed fingers touch its surroundings", "close in the surroundings"
                 continue
-            way = back.path.waypoints
-            near = next((guard for guard in self._guards if guard.meets(way)), None)
+            near = next((guard for guard in self._guards if guard.meets(away)), None)
             if near is not None:
                 reason, kind = near.reason, near.kind
                 continue
-            clearance = float(back.path.certificate.clearance)
-            return Reached(q, back.path.waypoints[::-1].copy(), clearance, self._limits(q))
+            return Reached(q, away[::-1].copy(), float(clearance), self._limits(q), T_world_pregrasp=T_start)
         return Reached(None, None, 0.0, 0.0, reason, kind)
+
+    def _plan_may_end(self, q: Array) -> NDArray[np.bool_]:
+        """Return whether a plan may end at each configuration (K, J): the open hand keeps the margins there."""
+        if self.departure is None or not len(q):
+            return np.ones(len(q), dtype=bool)
+        return ~self._open.check(self.departure, q).in_collision
+
+    @staticmethod
+    def _farthest(T_world_tcp: Array, T_world_pregrasp: Array) -> Array:
+        """Return the tool's pose at the start of the longest approach."""
+        least = float(np.linalg.norm(T_world_tcp[:3, 3] - T_world_pregrasp[:3, 3]))
+        return along(T_world_tcp, -max(CONSTANTS.max_retreat, least))
 
     def _limits(self, q: Array) -> float:
         chain = self.robot.chain

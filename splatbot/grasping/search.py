@@ -369,6 +369,8 @@ class Search:
         if reached.q is None or reached.path is None:
             return replace(grasp, rejected=reached.reason), reached.kind
         found = _with_terms(grasp, arm_terms(reached))
+        if reached.T_world_pregrasp is not None:
+            found = replace(found, T_world_pregrasp=reached.T_world_pregrasp)
         return replace(found, q=reached.q, q_pregrasp=reached.path[0], approach_path=reached.path), ""
 
     def _at_full_density(self, grasp: Grasp, raw: RawDepth) -> tuple[Grasp, str]:
@@ -376,7 +378,8 @@ class Search:
 
         The width grows to that at which the points stop the fingers, and the closed hand is checked too.
         """
-        hands, retreat = Hands.one(grasp.T_world_tcp, grasp.opening), self.o.pregrasp
+        hands = Hands.one(grasp.T_world_tcp, grasp.opening)
+        retreat = grasp.approach_length
         points = raw.along_approach(hands, self.s.hand, retreat)
         width = max(grasp.width, float(closed_width(hands, points, self.s.hand)[0]))
         deep = max(

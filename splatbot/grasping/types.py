@@ -84,6 +84,11 @@ class Grasp:
         return tuple(bool(b) for b in blind(self.depth_distance, self.unseen))
 
     @property
+    def approach_length(self) -> float:
+        """Return the length of the straight approach from the pre-grasp to the grasp [m]."""
+        return float(np.linalg.norm(self.T_world_tcp[:3, 3] - self.T_world_pregrasp[:3, 3]))
+
+    @property
     def avoids_moving(self) -> bool:
         """Return whether hand and arm avoid the regions where motion was observed, at the grasp and on its approach.
 

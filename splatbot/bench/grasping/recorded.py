@@ -69,9 +69,8 @@ def _measure(results: Results, case: str, path: Path, name: str, raw: RawDepth, 
         counts["objects with grasps on implied sides alone"] += bool(result.doubtful) and not result.grasps
         counts["grasps"] += len(result.grasps)
         for grasp in result.grasps:
-            measured = np.concatenate(
-                [around, raw.along_approach(Hands.one(grasp.T_world_tcp, grasp.opening), hand, GraspOptions().pregrasp)]
-            )
+            on_way = raw.along_approach(Hands.one(grasp.T_world_tcp, grasp.opening), hand, grasp.approach_length)
+            measured = np.concatenate([around, on_way])
             deep = _deepest(grasp, measured, hand)
             deepest.append(deep)
             counts["hands deeper than 3 mm in confirmed depth"] += deep > _DEEP_M
@@ -99,8 +98,8 @@ def _measure(results: Results, case: str, path: Path, name: str, raw: RawDepth, 
 
 def _deepest(grasp: Grasp, measured: Array, hand: HandShape) -> float:
     """Return the depth of the deepest confirmed point in the hand, on its approach and closed [m]."""
-    retreat = float(np.linalg.norm(grasp.T_world_tcp[:3, 3] - grasp.T_world_pregrasp[:3, 3]))
+    approaching = Hands.one(grasp.T_world_tcp, grasp.opening)
     return max(
-        float(hand_penetration(Hands.one(grasp.T_world_tcp, grasp.opening), measured, hand, retreat=retreat)[0]),
+        float(hand_penetration(approaching, measured, hand, retreat=grasp.approach_length)[0]),
         float(hand_penetration(Hands.one(grasp.T_world_tcp, grasp.width), measured, hand, retreat=0.0)[0]),
     )

@@ -250,7 +250,7 @@ def test_a_pregrasp_is_where_a_plan_may_end_and_the_arm_stays_out_of_unknown_spa
     sampler.agree_with_plans(both, GaussianCollisionField(ball, 2.0))
     result = sampler.sample(target, few)
     assert result.grasps
-    assert result.rejected["hands: start where no plan may end"] > 0
+    assert result.rejected["hands: bring the arm into unknown space"] > 0
     open_, links = panda().spheres(), panda().spheres().link < 7
     for g in result.grasps:
         assert g.approach_path is not None
@@ -263,6 +263,27 @@ def test_a_pregrasp_is_where_a_plan_may_end_and_the_arm_stays_out_of_unknown_spa
                 moving = open_.link > 0  # the base stands on the table
                 assert gap.min() > margin - 1e-6
                 assert (plans.clearance(at[moving], cut=0.2).distance - open_.radii[moving]).min() > margin - 1e-6
+
+
+def test_an_approach_starts_farther_back_where_no_plan_may_end_at_the_pregrasp_asked_for() -> None:
+    target, few, margin = target_of(scene(), BOX, "box"), GraspOptions(samples=100, pregrasp=0.02), 0.05
+    sampler = GraspSampler(scene(), panda(), arm_margin=margin)
+    sampler.agree_with_plans(GaussianCollisionField(scene().model, 2.0))
+    result = sampler.sample(target, few)
+    assert result.grasps
+    open_hand = RobotSpheres(panda(), T_world_base=scene().T_world_base, margin=margin)
+    for g in result.grasps:
+        assert g.approach_path is not None
+        blocked = open_hand.check(GaussianCollisionField(scene().model, 2.0), g.approach_path).in_collision
+        assert not blocked[0]
+        assert blocked[1:].all()  # no nearer place is free
+        start = scene().T_world_base @ panda().fk(g.approach_path[:1])[0, -1] @ panda().T_link_tcp
+        assert np.abs(start - g.T_world_pregrasp).max() < 1e-3
+        away = g.T_world_tcp[:3, 3] - g.T_world_pregrasp[:3, 3]
+        length = np.linalg.norm(away)
+        assert few.pregrasp < length <= 0.3
+        assert np.abs(away - length * g.T_world_tcp[:3, 2]).max() < 1e-9
+        assert (g.q_pregrasp == g.approach_path[0]).all()
 
 
 INNER, OUTER, HIGH, RIM = 0.021, 0.0325, 0.016, 0.0055  # [m] of a low ring
