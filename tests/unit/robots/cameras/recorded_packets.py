@@ -1,0 +1,88 @@
+"""Packets of an OAK camera, sent into a depthai pipeline by host nodes instead of a device."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import timedelta
+from typing import Any
+
+os.environ.setdefault("DEPTHAI_LEVEL", "error")
+
+import depthai as dai
+import numpy as np
+from numpy.typing import NDArray
+
+from splatbot.robots.cameras.stream_options import StreamOptions
+
+PERIOD_S = 1 / 30
+
+
+@dataclass(frozen=True)
+class Packet:
+    """An image as the device sends it.
+
+    Args:
+        stamp: [s] of depthai's clock, at the end of the exposure.
+        image: pixels, (H, W, 3) or (H, W).
+        kind: name of its depthai type.
+        K: (3, 3) intrinsic matrix.
+        sequence: its number.
+        lens: distortion in depthai's order, which is OpenCV's.
+    """
+
+    stamp: float
+    image: NDArray[Any]
+    kind: str
+    K: NDArray[np.float64]
+    sequence: int
+    lens: tuple[float, ...] = ()
+
+    def message(self) -> Any:
+        """Return it as depthai has it."""
+        height, width = self.image.shape[:2]
+        message = dai.ImgFrame()
+        message.setData(np.ascontiguousarray(self.image).view(np.uint8).ravel())  # type: ignore[arg-type]
+        message.setWidth(width)
+        message.setHeight(height)
+        message.setStride(self.image.strides[0])
+        message.setType(getattr(dai.ImgFrame.Type, self.kind))
+        message.setTimestamp(timedelta(seconds=self.stamp))
+        message.setSequenceNum(self.sequence)
+        lens = [*self.lens, *[0.0] * (14 - len(self.lens))]
+        message.setTransformation(
+            dai.ImgTransformation(width, height, self.K.tolist(), dai.CameraModel.Perspective, lens)
+        )
+        return message
+
+
+class _Sender(dai.node.ThreadedHostNode):
+    def __init__(self) -> None:
+        super().__init__()
+        self.out = self.createOutput()
+        self.packets: Sequence[Packet] = ()
+
+    def run(self) -> None:
+        for packet in self.packets:
+            if not self.isRunning():
+                return
+            self.out.send(packet.message())
+            time.sleep(PERIOD_S)
+
+
+class RecordedStreams:
+    """Sources of :class:`splatbot.robots.cameras.oak.OakCamera` that send packets."""
+
+    def __init__(self, color: Sequence[Packet], depth: Sequence[Packet]) -> None:
+        self._color, self._depth = color, depth
+
+    def __call__(self, pipeline: Any, _options: StreamOptions) -> tuple[Any, Any]:
+        """Create the nodes in a pipeline and return their outputs."""
+        outputs = []
+        for packets in (self._color, self._depth):
+            sender = pipeline.create(_Sender)
+            sender.packets = packets
+            outputs.append(sender.out)
+        return outputs[0], outputs[1]

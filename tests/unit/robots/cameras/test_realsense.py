@@ -1,0 +1,191 @@
+"""RealSense cameras: librealsense's software device is the other side of the driver."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from itertools import islice
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from splatbot.errors import DeviceError, InputError
+from splatbot.frame import Frame
+from splatbot.robots.cameras import RealsenseCamera, open_camera, realsense
+from splatbot.robots.cameras.stream_options import StreamOptions
+
+rs = pytest.importorskip("pyrealsense2", reason="pyrealsense2 (extra realsense) is not installed")
+
+WIDTH, HEIGHT, UNITS = 160, 120, 0.00025  # [m] a depth unit that is not a millimetre
+NO_LENS = (0.0,) * 5
+
+
+def intrinsics(fx: float, model: Any, coefficients: tuple[float, ...]) -> Any:
+    """Return intrinsics of librealsense."""
+    made = rs.intrinsics()
+    made.width, made.height, made.fx, made.fy, made.ppx, made.ppy = WIDTH, HEIGHT, fx, fx + 1, 80.5, 58.0
+    made.model, made.coeffs = model, list(coefficients)
+    return made
+
+
+class SoftwareStreams:
+    """Streams of a software device that sends images of colour and depth from a thread."""
+
+    def __init__(
+        self,
+        images: list[tuple[NDArray[np.uint8], NDArray[np.uint16]]],
+        *,
+        lens: tuple[float, ...] = NO_LENS,
+        baseline: float = 0.0,
+        domain: Any = None,
+        missing: tuple[int, ...] = (),
+    ) -> None:
+        self._images, self._missing = images, missing
+        self._domain = domain or rs.timestamp_domain.hardware_clock
+        self._device = rs.software_device()
+        model = rs.distortion.inverse_brown_conrady
+        self._profiles = []
+        for name, stream, kind, size, lenses in (
+            ("Stereo Module", rs.stream.depth, rs.format.z16, 2, NO_LENS),
+            ("RGB Camera", rs.stream.color, rs.format.rgb8, 3, lens),
+        ):
+            sensor = self._device.add_sensor(name)
+            video = rs.video_stream()
+            video.type, video.index, video.uid, video.fmt, video.bpp = stream, 0, size - 2, kind, size
+            video.width, video.height, video.fps = WIDTH, HEIGHT, 30
+            video.intrinsics = intrinsics(140.0 if size == 3 else 130.0, model, lenses)
+            self._profiles.append((sensor, sensor.add_video_stream(video), size))
+        moved = rs.extrinsics()
+        moved.rotation, moved.translation = [1, 0, 0, 0, 1, 0, 0, 0, 1], [baseline, 0, 0]
+        self._profiles[0][1].register_extrinsics_to(self._profiles[1][1], moved)
+        self._device.create_matcher(rs.matchers.default)
+        self._pairs = rs.syncer(16)
+        for sensor, profile, _ in self._profiles:
+            sensor.open(profile)
+            sensor.start(self._pairs)
+        threading.Thread(target=self._send, daemon=True).start()
+
+    def _send(self) -> None:
+        for number, images in enumerate(self._images, 1):
+            if number in self._missing:
+                continue
+            for (sensor, profile, size), pixels in zip(self._profiles, reversed(images), strict=True):
+                frame = rs.software_video_frame()
+                frame.stride, frame.bpp, frame.pixels = WIDTH * size, size, np.ascontiguousarray(pixels)
+                frame.timestamp = 1000 * (number - 1) / 30  # the matcher of software devices needs stamps from 0
+                frame.domain, frame.frame_number = self._domain, number
+                frame.profile = profile.as_video_stream_profile()
+                if size == 2:
+                    frame.depth_units = UNITS
+                sensor.on_video_frame(frame)
+            time.sleep(0.0301)
+
+    def wait(self, milliseconds: int) -> Any:
+        came, pair = self._pairs.try_wait_for_frames(milliseconds)
+        return pair if came and pair.get_color_frame() and pair.get_depth_frame() else None
+
+    def stop(self) -> None:
+        for sensor, _, _ in self._profiles:
+            sensor.stop()
+            sensor.close()
+
+
+def scene(count: int) -> list[tuple[NDArray[np.uint8], NDArray[np.uint16]]]:
+    """Return images of a plane at 0.6 m with a smooth texture that differs by frame."""
+    v, u = np.mgrid[:HEIGHT, :WIDTH]
+    flat = np.full((HEIGHT, WIDTH), round(0.6 / UNITS), np.uint16)
+    waves = [(127 + 120 * np.sin(u / 9 + k), 127 + 120 * np.cos(v / 7), (u + v) / 2) for k in range(count)]
+    return [(np.stack(np.broadcast_arrays(*wave), axis=2).astype(np.uint8), flat) for wave in waves]
+
+
+def opened(make: Callable[[], SoftwareStreams]) -> RealsenseCamera:
+    """Return a camera of a software device."""
+    return RealsenseCamera(open_streams=lambda _serial, _options: make())
+
+
+def seen(camera: RealsenseCamera, count: int) -> list[Frame]:
+    """Return frames of a camera, which is then closed."""
+    frames = list(islice(iter(camera), count))
+    camera.close()
+    return frames
+
+
+def test_frames_have_pixels_units_intrinsics_and_stamps_of_the_device() -> None:
+    images = scene(6)
+    frames = seen(opened(lambda: SoftwareStreams(images)), 3)
+    for frame in frames:
+        k = next(k for k, (rgb, _) in enumerate(images) if (rgb == frame.rgb).all())
+        assert frame.stamp - frames[0].stamp == pytest.approx((k - _first(images, frames)) / 30, abs=1e-6)
+        inner = frame.depth[30:-30, 30:-30]
+        np.testing.assert_allclose(inner[inner > 0], 0.6, rtol=1e-6)
+        assert (inner > 0).all()
+        assert (frame.camera.fx, frame.camera.fy, frame.camera.cx, frame.camera.cy) == (140.0, 141.0, 80.5, 58.0)
+        assert frame.depth_delay == 0.0
+    assert abs(frames[0].stamp - time.time()) < 3.0
+
+
+def _first(images: list[tuple[NDArray[np.uint8], NDArray[np.uint16]]], frames: list[Frame]) -> int:
+    return next(k for k, (rgb, _) in enumerate(images) if (rgb == frames[0].rgb).all())
+
+
+def test_stamps_in_system_time_are_kept() -> None:
+    (frame,) = seen(opened(lambda: SoftwareStreams(scene(4), domain=rs.timestamp_domain.system_time)), 1)
+    assert 0.0 <= frame.stamp < 1.0
+
+
+def test_depth_is_registered_to_colour_over_the_baseline() -> None:
+    def step() -> list[tuple[NDArray[np.uint8], NDArray[np.uint16]]]:
+        near = np.full((HEIGHT, WIDTH), round(0.5 / UNITS), np.uint16)
+        near[:, WIDTH // 2 :] = round(1.0 / UNITS)
+        return [(rgb, near) for rgb, _ in scene(4)]
+
+    (frame,) = seen(opened(lambda: SoftwareStreams(step(), baseline=0.05)), 1)
+    # A point at depth column 79, 0.5 m away, is at x = (79 - 80.5) / 130 * 0.5 + 0.05 m in the frame of colour.
+    edge = ((79 - 80.5) / 130 * 0.5 + 0.05) / 0.5 * 140 + 80.5
+    row = frame.depth[60]
+    assert np.flatnonzero(np.isclose(row, 0.5, atol=1e-3)).max() == pytest.approx(edge, abs=1.5)
+
+
+def test_a_distorted_lens_is_undone_as_librealsense_defines_it() -> None:
+    lens = (0.08, -0.03, 0.004, -0.003, 0.01)
+    rgb = scene(1)[0][0]
+    (frame,) = seen(opened(lambda: SoftwareStreams(scene(1) * 4, lens=lens)), 1)
+    given = intrinsics(140.0, rs.distortion.inverse_brown_conrady, lens)
+    errors = []
+    for v in range(10, HEIGHT - 10, 7):
+        for u in range(10, WIDTH - 10, 7):  # the ray of a recorded pixel, by librealsense, and its undistorted pixel
+            x, y, _ = rs.rs2_deproject_pixel_to_point(given, [float(u), float(v)], 1.0)
+            at = np.array([x * 140.0 + 80.5, y * 141.0 + 58.0])
+            if (at < 4).any() or at[0] > WIDTH - 5 or at[1] > HEIGHT - 5:
+                continue
+            low = np.floor(at).astype(int)
+            a, b = at - low
+            patch = frame.rgb[low[1] : low[1] + 2, low[0] : low[0] + 2].astype(float)
+            value = (1 - b) * ((1 - a) * patch[0, 0] + a * patch[0, 1]) + b * ((1 - a) * patch[1, 0] + a * patch[1, 1])
+            errors.append(np.abs(value - rgb[v, u]).max())
+    assert len(errors) > 100
+    assert max(errors) < 4.0
+    assert not frame.camera.distortion
+
+
+def test_lost_images_are_counted_and_a_silent_device_is_gone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(realsense, "CONSTANTS", realsense.RealsenseConstants(silence_s=0.5, poll_ms=50))
+    camera = opened(lambda: SoftwareStreams(scene(8), missing=(4, 5)))
+    with pytest.raises(DeviceError, match="is gone"):
+        list(camera)
+    assert camera.dropped == 2
+
+
+def test_without_a_device_one_sentence_names_the_fix() -> None:
+    with pytest.raises(DeviceError, match="USB 3"):
+        next(iter(open_camera("realsense://")))
+
+
+def test_addresses_name_serial_size_and_rate() -> None:
+    camera = RealsenseCamera.from_uri("realsense://834412070000?size=848x480&fps=60")
+    assert camera.options == StreamOptions(848, 480, 60.0)
+    with pytest.raises(InputError, match="sixty"):
+        open_camera("realsense://?fps=sixty")
