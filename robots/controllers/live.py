@@ -1,0 +1,234 @@
+"""Base of controllers of real arms: checks before a motion, its clock, the tube around its curve, stops and faults."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+
+import numpy as np
+
+from splatbot.collision import RobotSpheres
+from splatbot.errors import ControllerError, InputError, SplatbotError
+from splatbot.planning.certify import CONSTANTS as CERTIFICATION
+from splatbot.planning.certify import CertifiedMotion, certify_motion
+from splatbot.protocols import Array, Feedback, MotionState, RobotKinematics, TimedPath
+from splatbot.robots.controllers.deviation import Deviation, between_set_points
+
+_GRID_S = 0.01  # [s] spacing of the samples of the curve that a measured position is compared with
+
+
+@dataclass(frozen=True)
+class LiveOptions:
+    """Tolerances and times of a real arm.
+
+    Args:
+        update_rate: rate of the set points that the drives receive [Hz]; between them they move straight.
+        start_tolerance: largest distance of the arm from the start of a motion [rad or m].
+        path_tolerance: largest distance of the arm from the curve [rad or m].
+        goal_tolerance: largest distance from the end of the motion at which it is done [rad or m].
+        goal_time: time after the end of the motion in which the arm may still arrive [s].
+        lag: largest delay of the measured position behind the curve [s].
+        max_age: largest age of a measured position [s].
+        stop_time: time in which the arm must rest after a stop [s].
+
+    Raises:
+        InputError: a value is not above 0.
+    """
+
+    update_rate: float = 100.0
+    start_tolerance: float = 0.01
+    path_tolerance: float = 0.05
+    goal_tolerance: float = 0.005
+    goal_time: float = 1.0
+    lag: float = 0.3
+    max_age: float = 0.2
+    stop_time: float = 3.0
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not 0.0 < value < np.inf:
+                raise InputError(f"is {value}.", field=name, hint="give a number above 0")
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """Measured state of an arm.
+
+    Args:
+        position, velocity: (J,) [rad or m, and per s].
+    """
+
+    position: Array
+    velocity: Array
+
+
+class LiveController:
+    """A :class:`splatbot.protocols.Controller` of a real arm; a subclass speaks to it.
+
+    A motion is sent only if the arm rests at its start and its limits hold for this robot. The executed motion may
+    deviate from the certified curve by the certified clearance at most: the resolution of the certificate and the
+    margin. During the motion the arm is stopped as soon as it leaves the tube around the curve.
+
+    Args:
+        robot: model of the arm; motions that were certified for another one are refused.
+        period: control period [s].
+        options: tolerances and times.
+
+    Raises:
+        InputError: the period is not above 0.
+    """
+
+    def __init__(self, robot: RobotKinematics, *, period: float, options: LiveOptions) -> None:
+        if not 0.0 < period < np.inf:
+            raise InputError(f"is {period}.", field="period", hint="give seconds above 0")
+        self.robot, self.options, self._period = robot, options, period
+        self._body = RobotSpheres(robot).without_pairs
+        self._motion: CertifiedMotion | None = None
+        self._desired: Array | None = None
+        self._curve: deque[Array] = deque(maxlen=int(np.ceil(options.lag / _GRID_S)) + 1)
+        self._time = self._sampled = 0.0
+        self._state, self._fault = MotionState.IDLE, ""
+        self._stopping = False
+
+    @property
+    def period(self) -> float:
+        """Control period [s]."""
+        return self._period
+
+    @property
+    def state(self) -> MotionState:
+        """State of the motion."""
+        return self._state
+
+    def deviation(self, motion: CertifiedMotion) -> Deviation:
+        """Bound the deviation of the executed set points from a certified curve."""
+        return between_set_points(motion.motion.pieces(), motion.arm.reach, 1.0 / self.options.update_rate)
+
+    def send(self, motion: TimedPath) -> None:
+        """Begin to follow a motion.
+
+        Raises:
+            ControllerError: the motion is not certified for this robot, exceeds a limit or begins elsewhere.
+            ControllerError: the executed motion would deviate too far from the certified curve.
+            ControllerError: the arm is at fault, moves, or does not report where it is.
+        """
+        if not isinstance(motion, CertifiedMotion):
+            hint = "certify it with splatbot.planning.certify_motion"
+            raise ControllerError(f"{type(motion).__name__} is not certified.", field="motion", hint=hint)
+        if self._state is MotionState.FAULT:
+            raise ControllerError(f"is at fault: {self._fault}.", field="controller", hint="reset it")
+        if self._state is MotionState.MOVING:
+            raise ControllerError("is moving.", field="controller", hint="stop it, or wait until it has arrived")
+        self._check_motion(motion)
+        start = motion.reference(0.0)[0]
+        distance = float(np.abs(start - self._resting().position).max())
+        if not distance <= self.options.start_tolerance:
+            hint = "plan from where the arm is"
+            raise ControllerError(f"begins {distance:.4f} from where the arm is.", field="motion", hint=hint)
+        self._curve.clear()
+        self._time = self._sampled = 0.0
+        self._begin(motion)
+        self._motion, self._stopping, self._state = motion, False, MotionState.MOVING
+
+    def step(self) -> Feedback:
+        """Wait for the end of one period; after :meth:`stop`, until the arm rests."""
+        if self._state is MotionState.MOVING and self._motion is not None:
+            try:
+                if self._stopping:
+                    self._halt()
+                    self._state = MotionState.STOPPED
+                elif self._follow(self._motion):
+                    self._state = MotionState.DONE
+            except SplatbotError as error:
+                self._fail(error)
+        else:
+            self._pass_period()
+        at = self._measured()
+        desired = at.position if self._desired is None else self._desired
+        return Feedback(self._time, at.position, at.velocity, desired, self._state, self._fault)
+
+    def stop(self) -> None:
+        """Stop at the next step."""
+        self._stopping = True
+
+    def reset(self) -> None:
+        """Clear a fault; the next motion is refused while its cause remains."""
+        self._state, self._fault = MotionState.IDLE, ""
+
+    def _check_motion(self, motion: CertifiedMotion) -> None:
+        if motion.arm.robot.name != self.robot.name:
+            text = f"is certified for {motion.arm.robot.name}, the arm is a {self.robot.name}."
+            raise ControllerError(text, field="motion", hint=f"plan for {self.robot.name}")
+        certify_motion(motion.motion, self._body, None)  # the limits of this robot, once more
+        deviation, margin = self.deviation(motion), motion.arm.margin
+        if not deviation.sphere <= CERTIFICATION.eps + margin:
+            text = (
+                f"moves the arm up to {1e3 * deviation.sphere:.3f} mm ({deviation.joint:.1e} rad) away from its curve."
+            )
+            need = 1e3 * deviation.sphere
+            hint = f"plan with a margin of {need:.1f} mm or more, slow the motion, or raise update_rate"
+            raise ControllerError(text, field="motion", hint=hint)
+
+    def _follow(self, motion: CertifiedMotion) -> bool:
+        """Follow a motion for one period; return whether the arm has arrived."""
+        self._time = t = self._advance(motion)
+        self._desired = motion.reference(t)[0]
+        while self._sampled <= t:
+            self._curve.append(motion.reference(self._sampled)[0])
+            self._sampled += _GRID_S
+        at = self._measured().position
+        distance = float(np.abs(np.stack([*self._curve, self._desired]) - at).max(axis=1).min())
+        if not distance <= self.options.path_tolerance:
+            raise ControllerError(f"is {distance:.4f} from the curve at {t:.3f} s.", field="arm")
+        if self._arrived(motion):
+            return True
+        if t > motion.duration + self.options.lag + self.options.goal_time:
+            raise ControllerError(f"has not arrived after {t:.3f} s.", field="arm")
+        return False
+
+    def _fail(self, error: SplatbotError) -> None:
+        self._state, self._fault = MotionState.FAULT, f"{error.field}: {error.message}".rstrip(".")
+        with suppress(SplatbotError):
+            self._abort()
+
+    def _wait(self, found: Callable[[], bool], timeout_s: float) -> bool:
+        """Return whether ``found`` becomes true within a time [s]."""
+        deadline = time.monotonic() + timeout_s
+        while not found():
+            if time.monotonic() > deadline:
+                return False
+            time.sleep(min(0.002, self._period))
+        return True
+
+    def _begin(self, motion: CertifiedMotion) -> None:
+        """Command a motion, or raise a ControllerError."""
+        raise NotImplementedError
+
+    def _advance(self, motion: CertifiedMotion) -> float:
+        """Let one period pass and return the time since the start [s]; raise a ControllerError at a fault."""
+        raise NotImplementedError
+
+    def _arrived(self, motion: CertifiedMotion) -> bool:
+        raise NotImplementedError
+
+    def _abort(self) -> None:
+        """Command the arm to stop, without waiting."""
+        raise NotImplementedError
+
+    def _halt(self) -> None:
+        """Stop the arm and wait until it rests, or raise a ControllerError."""
+        raise NotImplementedError
+
+    def _measured(self) -> Measured:
+        """Return the latest measured state, which may be old."""
+        raise NotImplementedError
+
+    def _resting(self) -> Measured:
+        """Return the measured state of the arm at rest; raise a ControllerError if it is old or the arm moves."""
+        raise NotImplementedError
+
+    def _pass_period(self) -> None:
+        time.sleep(self._period)
