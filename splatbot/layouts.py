@@ -7,9 +7,12 @@ from typing import Literal
 
 from splatbot.errors import FormatError, LogError
 
-LogKind = Literal["synthetic", "bag", "tum", "replica", "7scenes", "images", "transforms", "scannet", "record3d"]
+LogKind = Literal[
+    "synthetic", "bag", "tum", "replica", "7scenes", "images", "transforms", "scannet", "record3d", "lerobot"
+]
 
 MAP_NAME = "map.ply"
+RECORDING = "recording.mcap"
 TRAINING_NAME = "training.json"
 MAP_SUFFIXES = (".ply", ".splat", ".spz", ".sog", ".glb")
 """Ends of the names of map files that splatbot.formats reads."""
@@ -17,10 +20,12 @@ MAP_SUFFIXES = (".ply", ".splat", ".spz", ".sog", ".glb")
 _SOG_NAME = "meta.json"  # of a map in a folder of WebP images
 _LAYOUTS_HINT = (
     "known folders: rgb.txt with depth.txt (TUM), results/ with traj.txt (Replica), metadata.yaml (ROS 2), 7-Scenes, "
-    "color/ with depth/ (Open3D, ScanNet). Known files: .mcap, .bag, .sens, .r3d; `synthetic:tabletop` needs no files"
+    "color/ with depth/ (Open3D, ScanNet), meta/info.json (LeRobot). Known files: .mcap, .bag, .sens, .r3d; "
+    "`synthetic:tabletop` needs no files"
 )
 _FILES: dict[str, LogKind] = {".mcap": "bag", ".bag": "bag", ".sens": "scannet", ".r3d": "record3d"}
-_TRANSFORMS_HEAD = 2**20  # bytes of transforms.json that hold its first frames
+_WITH_OPTIONS = ("bag", "lerobot")  # kinds whose path may be followed by ?KEY=VALUE&KEY=VALUE
+_HEAD = 2**20  # bytes of a JSON file that hold its description, or its first frames
 _AS_TUM = "write rgb/, depth/ (16-bit PNG), rgb.txt, depth.txt and intrinsics.json (docs/guide/mapping.md)"
 _FROM_A_LOG = f"map a recording; splatbot reads files of Gaussians ({', '.join(MAP_SUFFIXES)})"
 _AS_PLY = "open it in https://superspl.at/editor and export it as PLY"
@@ -75,9 +80,8 @@ def log_kind(uri: str | Path) -> LogKind:
     if text.startswith("synthetic:"):
         return "synthetic"
     place = Path(text)
-    bag = Path(text.partition("?")[0])  # topics follow the path of a bag
-    kind = _kind(place if place.exists() else bag)
-    if kind is not None and (kind == "bag" or place.exists()):
+    kind = _kind(place if place.exists() else Path(text.partition("?")[0]))
+    if kind is not None and (kind in _WITH_OPTIONS or place.exists()):
         return kind
     if not place.exists():
         raise LogError("does not exist.", file=place, field="log", hint=f"check the path; {_LAYOUTS_HINT}")
@@ -96,21 +100,23 @@ def _kind(path: Path) -> LogKind | None:
         return "bag"
     if any((path / name).exists() for name in ("rgb.txt", "depth.txt")):
         return "tum"
+    if _names(path / "meta/info.json", b'"codebase_version"'):
+        return "lerobot"
     if (path / "results").is_dir() and (path / "traj.txt").exists():
         return "replica"
     if any(path.glob("frame-*.color.png")):
         return "7scenes"
     if (path / "color").is_dir() and (path / "depth").is_dir():
         return "images"
-    return "transforms" if _has_depth(path / "transforms.json") else None
+    return "transforms" if _names(path / "transforms.json", b'"depth_file_path"') else None
 
 
-def _has_depth(transforms: Path) -> bool:
-    """Return whether the frames of a Nerfstudio scene name depth images."""
-    if not transforms.is_file():
+def _names(file: Path, key: bytes) -> bool:
+    """Return whether a file exists and its beginning has a key."""
+    if not file.is_file():
         return False
-    with transforms.open("rb") as file:
-        return b'"depth_file_path"' in file.read(_TRANSFORMS_HEAD)
+    with file.open("rb") as opened:
+        return key in opened.read(_HEAD)
 
 
 def map_file(path: str | Path) -> Path:

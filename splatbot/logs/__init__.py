@@ -40,7 +40,8 @@ def open_log(
     Args:
         uri: a folder in TUM, Replica, 7-Scenes, Open3D, ScanNet or Nerfstudio layout, or a `.sens` or `.r3d` file. A
             recording of ROS topics is an `.mcap`, a rosbag2 folder or a `.bag`. Select one of several cameras by
-            `FILE?color=TOPIC&depth=TOPIC&info=TOPIC`. Generated logs have the form
+            `FILE?color=TOPIC&depth=TOPIC&info=TOPIC`. In a LeRobot dataset, `FOLDER?episode=N&color=KEY&depth=KEY`
+            selects an episode and a camera. Generated logs have the form
             `synthetic:SCENE?trajectory=NAME&frames=N&effects=SPEC;SPEC&...` with the keys of
             :class:`splatbot.logs.synthetic.SyntheticOptions`.
         camera: a preset (tum_fr1, tum_fr2, tum_fr3), an `intrinsics.json` or a calibration that replaces the log's own.
@@ -58,6 +59,8 @@ def open_log(
         return _OWN_CAMERAS[kind](str(uri))
     if kind == "bag":
         return _open_bag(str(uri), camera, joint_delay)
+    if kind == "lerobot":
+        return _open_lerobot(str(uri), camera, joint_delay)
     if kind == "tum":
         return TumLog(Path(uri), camera=camera, missing=missing, joint_delay=joint_delay)
     return _FOLDERS[kind](Path(uri), camera=camera)
@@ -74,6 +77,16 @@ def _open_bag(uri: str, camera: str | Path | Calibration | None, joint_delay: fl
 
     path, topics = split_query(uri)
     return BagLog(path, camera=camera, topics=topics, joint_delay=joint_delay)
+
+
+def _open_lerobot(uri: str, camera: str | Path | Calibration | None, joint_delay: float) -> Log:
+    from splatbot.logs.lerobot_packages import require_lerobot
+
+    require_lerobot(uri)
+    from splatbot.logs.lerobot import LeRobotLog, split_query  # imports the optional packages pyarrow and av
+
+    folder, options = split_query(uri)
+    return LeRobotLog(folder, options=options, camera=camera, joint_delay=joint_delay)
 
 
 _OWN_CAMERAS: dict[LogKind, Callable[[str], Log]] = {
