@@ -25,6 +25,8 @@ from splatbot.services.motion_gate import MotionGate, MotionRequest, MotionWatch
 from splatbot.services.store import MapStore
 from splatbot.services.topics import JOINTS, JointState, arm_topic, motion_topic, robot_topic
 
+REAL = "real"  # the arm on the network
+
 _FEEDBACK_PERIOD_S = 0.02
 
 _log = logging.getLogger(__name__)
@@ -64,12 +66,15 @@ class Arm:
         name: in URLs.
         robot: its model.
         make: makes the controller.
+        real: others may move the arm, too: by hand, or with its teach pendant.
     """
 
     name: str
     robot: RobotModel
     make: Callable[[RobotModel], Controller]
+    real: bool = False
     lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
+    reading: threading.Lock = field(default_factory=threading.Lock, repr=False)
     controller: Controller | None = None
     feedback: Feedback | None = None
 
@@ -79,6 +84,17 @@ class Arm:
             self.controller = self.make(self.robot)
             self.feedback = self.controller.step()
         return self.controller
+
+    def look(self) -> None:
+        """Read the position of a real arm at rest."""
+        with self.reading:
+            if self.real and not self.busy:
+                self.feedback = self.ready().step()
+
+    def send(self, motion: CertifiedMotion) -> None:
+        """Begin a motion; the caller holds the lock."""
+        with self.reading:
+            self.ready().send(motion)
 
     @property
     def busy(self) -> bool:
@@ -128,7 +144,8 @@ class Arms:
         self._stop: EmergencyStop | None = None
         self._last_stop: EmergencyStop | None = None
         self.leases = Leases()
-        self.motions = Jobs(self._bus, workers=max(1, len(self._makers)), capacity=len(self._makers))
+        most = len(self._makers) + 1  # one for each arm, and one for a real arm: no motion waits for another arm's
+        self.motions = Jobs(self._bus, workers=most, capacity=most)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -140,8 +157,15 @@ class Arms:
         """The emergency stop in force, or None."""
         return self._stop
 
+    def connect(self, robot: RobotModel, controller: Controller) -> None:
+        """Add the arm ``real``, whose controller is connected; call this before the service begins."""
+        arm = Arm(REAL, robot, lambda _: controller, real=True)
+        arm.ready()
+        with self._lock:
+            self._makers[REAL], self._arms[REAL] = arm.make, arm
+
     def get(self, name: str) -> Arm:
-        """Return an arm whose controller is ready.
+        """Return an arm whose controller is ready; the position of a real arm at rest is read.
 
         Raises:
             InputError: the name is unknown.
@@ -152,7 +176,8 @@ class Arms:
                 self._arms[name] = Arm(name, known_robot(self._robot), self._makers[name])
             arm = self._arms[name]
             arm.ready()
-            return arm
+        arm.look()
+        return arm
 
     def lease(
         self, name: str, owner: str, *, seconds: float | None, preempt: bool = False, admin: bool = False
@@ -207,7 +232,7 @@ class Arms:
             raise ControllerError("is moving.", field=f"arm {name}", hint="stop it, or wait until it has arrived")
         try:
             motion = self._gate.certify(request, arm.robot)
-            arm.ready().send(motion)
+            arm.send(motion)
             work = partial(self._follow, arm, request, motion, lease, last_stop)
             abandoned = partial(self._abandon, arm)
             return self.motions.submit("trajectory", work, key=key, request=content, abandoned=abandoned)[0]
@@ -222,8 +247,9 @@ class Arms:
     def _abandon(self, arm: Arm) -> None:
         """Let an arm rest whose motion does not begin."""
         controller = arm.ready()
-        controller.stop()
-        arm.feedback = controller.step()
+        with arm.reading:
+            controller.stop()
+            arm.feedback = controller.step()
         arm.lock.release()
 
     def _check_name(self, name: str) -> None:

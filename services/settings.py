@@ -53,6 +53,7 @@ class ServiceSettings(BaseSettings):
     save_every_s: float = Field(30.0, gt=0, description="how often growing maps are saved to data_dir [s]")
     robot: str | None = Field(None, description="robot that is masked in frames of ROS topics, cameras and --log")
     scene: Path | None = Field(None, description="scene.yaml with T_link_camera: the camera on that robot's link")
+    arm: str | None = Field(None, description="an arm on the network, e.g. ur:192.168.1.10; its model is `robot`")
     camera_wait_s: float = Field(60.0, ge=0, description="how long a camera that is gone is opened again [s]")
     max_maps: int = Field(256, ge=1, description="maps that are served at once")
     max_points: int = Field(100_000, ge=1, description="points in one distance request")

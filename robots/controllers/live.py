@@ -87,6 +87,7 @@ class LiveController:
         self.robot, self.options, self._period = robot, options, period
         self._body = RobotSpheres(robot).without_pairs
         self._motion: CertifiedMotion | None = None
+        self._at: Measured
         self._desired: Array | None = None
         self._curve: deque[Array] = deque(maxlen=int(np.ceil(options.lag / _GRID_S)) + 1)
         self._time = self._sampled = 0.0
@@ -134,25 +135,34 @@ class LiveController:
         self._motion, self._stopping, self._state = motion, False, MotionState.MOVING
 
     def step(self) -> Feedback:
-        """Wait for the end of one period; after :meth:`stop`, until the arm rests."""
+        """Wait for the end of one period; after :meth:`stop`, until the arm rests.
+
+        An arm at rest whose state is unknown is reported as a fault while this lasts.
+        """
+        problem = ""
         if self._state is MotionState.MOVING and self._motion is not None:
             try:
                 if self._stopping:
-                    self._halt()
+                    self._await_rest()
                     self._state = MotionState.STOPPED
                 elif self._follow(self._motion):
                     self._state = MotionState.DONE
+                self._at = self._measured()
             except SplatbotError as error:
                 self._fail(error)
         else:
             self._pass_period()
-        at = self._measured()
+            problem = self._look()
+        at, state = self._at, MotionState.FAULT if problem else self._state
         desired = at.position if self._desired is None else self._desired
-        return Feedback(self._time, at.position, at.velocity, desired, self._state, self._fault)
+        return Feedback(self._time, at.position, at.velocity, desired, state, problem or self._fault)
 
     def stop(self) -> None:
-        """Stop at the next step."""
+        """Command a stop at once; the next step waits until the arm rests."""
         self._stopping = True
+        if self._state is MotionState.MOVING:
+            with suppress(SplatbotError):  # the next step reports a stop that the arm does not heed
+                self._abort()
 
     def reset(self) -> None:
         """Clear a fault; the next motion is refused while its cause remains."""
@@ -189,8 +199,17 @@ class LiveController:
             raise ControllerError(f"has not arrived after {t:.3f} s.", field="arm")
         return False
 
+    def _look(self) -> str:
+        """Measure the state of an arm that does not follow a motion; return why it is unknown, or nothing."""
+        try:
+            self._check_states()
+            self._at = self._measured()
+        except SplatbotError as error:
+            return _reason(error)
+        return ""
+
     def _fail(self, error: SplatbotError) -> None:
-        self._state, self._fault = MotionState.FAULT, f"{error.field}: {error.message}".rstrip(".")
+        self._state, self._fault = MotionState.FAULT, _reason(error)
         with suppress(SplatbotError):
             self._abort()
 
@@ -218,8 +237,12 @@ class LiveController:
         """Command the arm to stop, without waiting."""
         raise NotImplementedError
 
-    def _halt(self) -> None:
-        """Stop the arm and wait until it rests, or raise a ControllerError."""
+    def _await_rest(self) -> None:
+        """Wait until a stopped arm rests, or raise a ControllerError."""
+        raise NotImplementedError
+
+    def _check_states(self) -> None:
+        """Check that states of the arm arrive, or raise a ControllerError."""
         raise NotImplementedError
 
     def _measured(self) -> Measured:
@@ -232,3 +255,7 @@ class LiveController:
 
     def _pass_period(self) -> None:
         time.sleep(self._period)
+
+
+def _reason(error: SplatbotError) -> str:
+    return f"{error.field}: {error.message}".rstrip(".")

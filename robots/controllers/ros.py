@@ -77,6 +77,7 @@ class RosController(LiveController):
             self.close()
             hint = f"publish {', '.join(robot.chain.names)} there, with increasing stamps"
             raise DeviceError(f"has no states of a {robot.name}.", field=states, hint=hint)
+        self._at = self._measured()
 
     def close(self) -> None:
         """Cancel a goal that may still run, and end the connections."""
@@ -117,8 +118,7 @@ class RosController(LiveController):
     def _advance(self, motion: CertifiedMotion) -> float:
         self._pass_period()
         self._check_link()
-        if self._states.age > self.options.max_age:
-            raise ControllerError(f"are {self._states.age:.2f} s old.", field=self._topic)
+        self._check_states()
         if self._result is not None and self._result.problem:
             raise ControllerError(f"ended: {self._result.problem}.", field="goal")
         return time.monotonic() - self._begun
@@ -137,9 +137,7 @@ class RosController(LiveController):
             self._goals.send(self._dialect.cancel(self._goal))
         self._reports.send(self._dialect.cancel_all())
 
-    def _halt(self) -> None:
-        self._abort()
-
+    def _await_rest(self) -> None:
         def rests() -> bool:
             self._check_link()
             return self._result is not None and self._states.age <= self.options.max_age and self._states.rests
@@ -147,16 +145,18 @@ class RosController(LiveController):
         if not self._wait(rests, self.options.stop_time):
             raise ControllerError(f"does not rest {self.options.stop_time:g} s after the stop.", field="arm")
 
+    def _check_states(self) -> None:
+        if self._states.age > self.options.max_age:
+            hint = "check the robot's joint state broadcaster, and the stamps, which must increase"
+            raise ControllerError(f"are {self._states.age:.2f} s old.", field=self._topic, hint=hint)
+
     def _measured(self) -> Measured:
         latest = self._states.latest()
         assert latest is not None  # the constructor waited for it, and states are kept
         return Measured(*latest)
 
     def _resting(self) -> Measured:
-        fresh = self._wait(lambda: self._states.age <= self.options.max_age, _SETTLE_S)
-        if not fresh:
-            hint = "check the robot's joint state broadcaster, and the stamps, which must increase"
-            raise ControllerError(f"are {self._states.age:.2f} s old.", field=self._topic, hint=hint)
+        self._check_states()
         if not self._wait(lambda: self._states.rests, _SETTLE_S):
             raise ControllerError("moves.", field="arm", hint="wait until it rests")
         return self._measured()

@@ -78,6 +78,7 @@ class UrController(LiveController):
         self._control, self._receive = _connect(host, frequency)
         self._stamp, self._stamped = -1.0, 0.0
         self._steps = 0
+        self._at = self._measured()
 
     def close(self) -> None:
         """Stop the arm, and end the connections."""
@@ -88,11 +89,11 @@ class UrController(LiveController):
             interface.disconnect()
 
     def _begin(self, motion: CertifiedMotion) -> None:
-        self._check_robot()
+        self._check_states()
         self._steps = 0
 
     def _advance(self, motion: CertifiedMotion) -> float:
-        self._check_robot()
+        self._check_states()
         self._steps += 1
         t = self._steps * self._period
         q = motion.reference(t)[0].tolist()
@@ -117,8 +118,7 @@ class UrController(LiveController):
         self._call(self._control.servoStop, self._deceleration)
         self._call(self._control.stopJ, self._deceleration)
 
-    def _halt(self) -> None:
-        self._abort()
+    def _await_rest(self) -> None:
         if not self._wait(lambda: bool(np.abs(self._measured().velocity).max() <= _RESTING), self.options.stop_time):
             raise ControllerError(f"does not rest {self.options.stop_time:g} s after the stop.", field="arm")
 
@@ -147,8 +147,8 @@ class UrController(LiveController):
             self._stamp, self._stamped = stamp, now
         return now - self._stamped
 
-    def _check_robot(self) -> None:
-        """Raise a ControllerError if the robot is lost, stopped, or does not run the program of ur_rtde."""
+    def _check_states(self) -> None:
+        """Check that the robot answers, is not stopped, and runs the program of ur_rtde."""
         control, receive = self._control, self._receive
         if not (self._call(control.isConnected) and self._call(receive.isConnected)):
             raise ControllerError(

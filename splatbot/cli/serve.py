@@ -17,6 +17,8 @@ from splatbot.layouts import log_kind, map_file
 if TYPE_CHECKING:
     from splatbot.logs import Log
     from splatbot.protocols import FrameSource
+    from splatbot.robots.controllers.ros import RosController
+    from splatbot.robots.controllers.ur import UrController
     from splatbot.services.runtime import Runtime
     from splatbot.services.settings import ServiceSettings
 
@@ -36,6 +38,7 @@ def serve(
     record: Annotated[Path | None, tyro.conf.arg(metavar="MCAP")] = None,
     robot: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None,
     scene: Annotated[Path | None, tyro.conf.arg(metavar="YAML")] = None,
+    arm: Annotated[str | None, tyro.conf.arg(metavar="ADDRESS")] = None,
     config: Annotated[Path | None, tyro.conf.arg(metavar="YAML")] = None,
     service_config: Annotated[Path | None, tyro.conf.arg(metavar="YAML")] = None,
     insecure_no_auth: bool = False,
@@ -50,6 +53,7 @@ def serve(
         splatbot serve --log recordings/wrist --robot panda
         splatbot serve --camera "replay:recordings/desk?loop=1" --viewer-port 8001 --ros-port 9090
         SPLATBOT_LOG_ROOTS=recordings splatbot serve --data maps
+        splatbot serve --map runs/desk --robot ur5e --arm ur:192.168.1.10
         splatbot serve --new-key --scopes read,move
         curl localhost:8000/v1/maps/default/distance -H 'content-type: application/json' -d '{"points": [[0, 0, 1]]}'
 
@@ -71,6 +75,8 @@ def serve(
             joint states at its time is not mapped.
         scene: scene.yaml with T_link_camera, the camera on the robot's link, and joint_delay; by default that of the
             log's folder.
+        arm: an arm on the network, the arm "real" of the service; --robot is its model (docs/guide/arms.md).
+            ros:ws://HOST:9090/ACTION for ros2_control, ur:HOST for Universal Robots; or SPLATBOT_ARM.
         record: record every topic into this MCAP file, from which the frames can be mapped again.
         config: YAML file with the configuration of mapping.
         service_config: YAML file with the service's address, keys and limits.
@@ -103,7 +109,7 @@ def serve(
     from splatbot.services.settings import load_settings
 
     given = {"host": host, "port": port, "ros_port": ros_port, "viewer_port": viewer_port, "record": record}
-    given |= {"robot": robot, "scene": scene}
+    given |= {"robot": robot, "scene": scene, "arm": arm}
     given["insecure_no_auth"] = insecure_no_auth or None
     settings = load_settings(service_config, data_dir=data, **given)
     configure_logging(as_json=settings.log_json)
@@ -114,17 +120,39 @@ def serve(
         raise InputError("give a map, a log or a camera.", field="--map, --log, --camera", hint=hint)
     check_exposure(settings)
     runtime = Runtime(settings, config=load_config(config))
-    if map is not None:
-        _add_map(runtime, map)
-    elif device is not None:
-        _follow(runtime, device.removeprefix(PREFIX), lambda delay: open_camera(device, joint_delay=delay))
-    elif log is not None:
-        _follow(runtime, log, lambda delay: open_log(log, camera=camera, joint_delay=delay))
+    controller = None
     try:
+        if settings.arm is not None:
+            controller = _connect_arm(runtime, settings.arm)
+        if map is not None:
+            _add_map(runtime, map)
+        elif device is not None:
+            _follow(runtime, device.removeprefix(PREFIX), lambda delay: open_camera(device, joint_delay=delay))
+        elif log is not None:
+            _follow(runtime, log, lambda delay: open_log(log, camera=camera, joint_delay=delay))
         run_service(runtime, on_start=partial(_announce, settings))
     finally:
         runtime.close()
+        if controller is not None:
+            controller.close()
     return 0
+
+
+def _connect_arm(runtime: Runtime, address: str) -> RosController | UrController:
+    """Connect the arm of the settings; the caller closes it.
+
+    Raises:
+        InputError: keys are turned off, or the arm has no model.
+    """
+    from splatbot.robots.controllers.addresses import connect_arm
+
+    if runtime.settings.insecure_no_auth:
+        raise InputError("moves for clients without a key.", field="--arm", hint="leave out --insecure-no-auth")
+    if runtime.robot is None:
+        raise InputError("has no model.", field="--arm", hint="give --robot, as `splatbot robot list` names it")
+    controller = connect_arm(address, runtime.robot)
+    runtime.arms.connect(runtime.robot, controller)
+    return controller
 
 
 def _add_map(runtime: Runtime, map_: Path) -> None:

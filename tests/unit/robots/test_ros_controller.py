@@ -196,6 +196,11 @@ def test_joint_states_that_stall_refuse_a_start(motion: CertifiedMotion) -> None
         with pytest.raises(ControllerError, match=r"/joint_states: are \d\.\d+ s old"):
             controller.send(motion)
         assert not arm.goals
+        feedback = controller.step()
+        assert feedback.state is MotionState.FAULT
+        assert "s old" in feedback.fault
+        arm.stalled = False
+        until(lambda: controller.step().state is MotionState.IDLE, 2.0)
 
 
 def test_repeated_joint_states_are_stale_although_they_arrive(motion: CertifiedMotion) -> None:
