@@ -53,8 +53,8 @@ CONSTANTS = OakConstants()
 class OakCamera:
     """An OAK camera as a source of frames; each iteration opens the device.
 
-    Stamps are Unix time in the middle of the exposure of colour. The difference between the device's clock, which
-    depthai keeps synchronized to the host's monotonic clock, and Unix time is measured once when the device is opened.
+    Stamps are Unix time in the middle of the exposure of colour. The library synchronizes the device's clock to the
+    host's monotonic clock. The difference of that to Unix time is measured once, when the device is opened.
 
     Attributes:
         dropped: frames of colour without a pair here: a slow reader or the transfer lost them.
@@ -123,8 +123,8 @@ class OakCamera:
             return dai.Device(dai.DeviceInfo(self._serial)) if self._serial else dai.Device()
         except RuntimeError as error:
             hint = (
-                "plug it into a USB 3 port, or give its IP address as in oak://192.168.1.44; on Linux a udev rule for "
-                'vendor 03e7 gives access ("splatbot doctor")'
+                "plug it into a USB 3 port, or give its IP address as in oak://192.168.1.44. On Linux, a udev rule for "
+                "vendor 03e7 gives access"
             )
             raise DeviceError(f"cannot be opened ({error}).", file=self.uri, field="camera", hint=hint) from error
 

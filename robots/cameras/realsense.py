@@ -188,8 +188,8 @@ class DeviceStreams:
 class _Lens:
     """Images of a RealSense colour camera as those of a pinhole camera with the same intrinsic matrix.
 
-    "Brown-Conrady" is OpenCV's model. "Inverse Brown-Conrady" of librealsense 2.5x projects as OpenCV's does, too, but
-    for tangential terms that multiply the radial factor: 1e-3 px apart with the lenses of these cameras.
+    "Brown-Conrady" is OpenCV's model. "Inverse Brown-Conrady" of librealsense 2.5x projects as OpenCV's does, but for
+    a radial factor in the tangential terms. They are 1e-3 px apart with the lenses of these cameras.
     """
 
     def __init__(self, rs: Any, intrinsics: Any, uri: str) -> None:

@@ -9,19 +9,21 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from splatbot.cli.cameras import CAMERA_PREFIXES, open_recorded, refuse_with_camera
 from splatbot.cli.doubts import camera_doubts, run_doubts
 from splatbot.cli.messages import print_message
 from splatbot.cli.paths import check_camera, check_file, check_output, check_state
 from splatbot.errors import InputError
-from splatbot.layouts import MAP_NAME, log_kind
+from splatbot.layouts import MAP_NAME, RECORDING, log_kind
 
 if TYPE_CHECKING:
+    from splatbot.logs import Log
     from splatbot.run import RunResult
     from splatbot.run.state import SavedRun
 
 
 def map_log_command(
-    log: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="LOG")] = "",
+    log: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="LOG|CAMERA")] = "",
     /,
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
     config: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
@@ -32,6 +34,7 @@ def map_log_command(
     camera: Annotated[str | None, tyro.conf.arg(metavar="PRESET|FILE")] = None,
     on_bad_frame: Literal["stop", "skip"] = "stop",
     max_frames: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
+    seconds: Annotated[float | None, tyro.conf.arg(metavar="S")] = None,
     realtime: bool = False,
     rate: Annotated[float | None, tyro.conf.arg(metavar="HZ")] = None,
     save_every: Annotated[float, tyro.conf.arg(metavar="S")] = 30.0,
@@ -43,11 +46,13 @@ def map_log_command(
     dump_config: bool = False,
     quiet: bool = False,
 ) -> int:
-    """Turn an RGB-D log into a map of Gaussians.
+    """Turn an RGB-D log, or the frames of a camera, into a map of Gaussians.
 
     Writes a run folder: map.ply, trajectory.tum, metrics.json, frames.jsonl, config.yaml, audit.json, report.html and
     map.html. Ctrl-C saves the current map; so does a frame that cannot be read. Every 30 s, and after the last frame,
     the whole state is saved too (RUN/state), for --resume and --localise.
+
+    A camera is recorded into RUN/recording.mcap while it is mapped, until Ctrl-C, --seconds or --max-frames.
 
     Examples:
         splatbot map recordings/desk
@@ -55,6 +60,7 @@ def map_log_command(
         splatbot map rgbd_dataset_freiburg1_desk --camera tum_fr1
         splatbot map recordings/desk --budget-ms 30 --realtime --rate 30
         splatbot map "synthetic:tabletop?frames=40" --out runs/tabletop
+        splatbot map oak:// --out runs/desk --seconds 60
         splatbot map --resume runs/desk
         splatbot map recordings/desk_again --localise runs/desk
         splatbot map recordings/wrist --robot panda
@@ -62,7 +68,8 @@ def map_log_command(
 
     Args:
         log: a folder in TUM or Replica layout, a recording of ROS topics (.mcap, rosbag2 folder, .bag), or
-            synthetic:SCENE?... (see splatbot simulate --list).
+            synthetic:SCENE?... (see splatbot simulate --list). A camera is oak://, realsense:// or replay:LOG
+            (docs/guide/cameras.md).
         out: folder to write; by default runs/NAME-TIME, with a link runs/latest.
         config: YAML file; environment variables (SPLATBOT_MAPPING__MAX_GAUSSIANS=...) and then --set override it.
         overrides: one key of the configuration, as in mapping.max_gaussians=50000.
@@ -71,6 +78,7 @@ def map_log_command(
         camera: intrinsics instead of the log's own: tum_fr1, tum_fr2, tum_fr3 or an intrinsics.json.
         on_bad_frame: reaction to a frame that cannot be read: save and stop, or skip it.
         max_frames: read only the first N frames.
+        seconds: with a camera, end after this time.
         realtime: feed frames at the times of their stamps, map in parallel with tracking, and drop late frames.
         rate: as realtime, at this rate [Hz].
         save_every: time between two saves of the state [s]; 0 never saves it.
@@ -89,6 +97,11 @@ def map_log_command(
         hint = "leave --config, --set and --budget-ms out, or map the log again"
         raise InputError("a saved run keeps its configuration.", field="--config, --set, --budget-ms", hint=hint)
     if not dump_config:
+        device = log.startswith(CAMERA_PREFIXES)
+        if device:
+            refuse_with_camera({"--camera": camera, "--robot": robot, "--resume": resume, "--rate": rate})
+        elif seconds is not None:
+            raise InputError("is for cameras.", field="--seconds", hint="give --max-frames")
         _check(log, out, resume, localise, max_frames=max_frames, overwrite=overwrite)
         check_camera(camera)
 
@@ -109,11 +122,16 @@ def map_log_command(
     if resume is not None and saved is not None:
         log, camera, out = log or saved.place.uri, camera or saved.place.camera, out or resume
         robot = robot or saved.place.robot
-    recording = open_without_robot(log, robot, camera=camera)
+    if device:
+        folder = out or _new_folder(log.partition("?")[0])
+        path = folder / RECORDING
+        recording: Log = open_recorded(log, path, max_frames=max_frames, seconds=seconds, overwrite=overwrite)
+    else:
+        recording = open_without_robot(log, robot, camera=camera)
+        folder = out or _new_folder(recording.name)
     if not quiet:
         for doubt in camera_doubts(recording.camera):
             print_message("question", doubt)
-    folder = out if out is not None else Path("runs") / f"{_slug(recording.name)}-{datetime.now():%Y%m%d-%H%M%S}"
     with progress_display(quiet=quiet) as on_progress:
         result = map_log(
             recording,
@@ -159,7 +177,7 @@ def _check(
     for saved in (resume, localise):
         if saved is not None:
             check_state(saved)
-    if log:
+    if log and not log.startswith(CAMERA_PREFIXES):
         log_kind(log)
     if resume is None or (out is not None and out.resolve() != resume.resolve()):
         check_output(out or Path("runs"))
@@ -202,6 +220,10 @@ def _parse_overrides(pairs: tuple[str, ...]) -> dict[str, Any]:
 def _lasting(camera: str) -> str:
     """Return an absolute path of a file, so that the run can be scored from any folder; keep names of presets."""
     return str(Path(camera).resolve()) if Path(camera).exists() else camera
+
+
+def _new_folder(name: str) -> Path:
+    return Path("runs") / f"{_slug(name)}-{datetime.now():%Y%m%d-%H%M%S}"
 
 
 def _slug(name: str) -> str:

@@ -134,9 +134,13 @@ def describe(progress: Progress, rate: float) -> str:
     verdict = progress.result.verdict if progress.result else "skipped"
     counts = mishaps(progress)
     return (
-        f"frame {progress.done}/{progress.total}  {rate:.1f} fps  {progress.gaussians:,} Gaussians  "
+        f"frame {_of(progress.done, progress.total)}  {rate:.1f} fps  {progress.gaussians:,} Gaussians  "
         f"{progress.keyframes} keyframes  {verdict}" + (f"  ({counts})" if counts else "")
     )
+
+
+def _of(done: int, total: int) -> str:
+    return f"{done}/{total}" if total else str(done)
 
 
 def mishaps(progress: Progress) -> str:
@@ -171,18 +175,18 @@ def _live() -> Iterator[Callable[[Progress], None]]:
             mapping = progress.phase == "mapping"
             if mapping:
                 rate.add(progress)
-            total, done = (progress.total, progress.done) if mapping else (progress.steps or None, progress.step)
+            total, done = (progress.total, progress.done) if mapping else (progress.steps, progress.step)
             if bars.tasks[task].description != progress.phase:
                 bars.refresh()  # the last state of the phase before, which may be younger than the last redraw
                 bars.reset(task)  # the time left is that of this phase
-                bars.tasks[task].total = total  # reset and update take None as "as before"
+                bars.tasks[task].total = total or None  # reset and update take None as "as before"
             verdict = progress.result.verdict if progress.result and mapping else ""
             bars.update(
                 task,
                 description=progress.phase,
-                total=total,
+                total=total or None,
                 completed=done,
-                counts="" if total is None else f"{done}/{total}",
+                counts=_of(done, total) if total or mapping else "",
                 numbers=_numbers(progress, rate.value, bars.console.width) if mapping else "",
                 verdict=verdict,
                 colour=_COLOURS.get(verdict, "white"),

@@ -1,47 +1,86 @@
-"""`splatbot record`: a log as one MCAP file."""
+"""`splatbot record`: a camera or a log as one MCAP file."""
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
+from splatbot.cli.cameras import CAMERA_PREFIXES, open_recorded, refuse_with_camera
 from splatbot.cli.paths import check_camera, check_output
+from splatbot.cli.progress import steps
 from splatbot.errors import InputError
 from splatbot.layouts import log_kind
 
 
 def record(
-    log: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="LOG")],
+    log: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="CAMERA|LOG")],
     /,
     *,
     out: Annotated[Path, tyro.conf.arg(metavar="FILE")],
     camera: Annotated[str | None, tyro.conf.arg(metavar="PRESET|FILE")] = None,
+    seconds: Annotated[float | None, tyro.conf.arg(metavar="S")] = None,
+    max_frames: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
+    quiet: bool = False,
 ) -> None:
-    """Write a log as one MCAP file of ROS 2 messages, which Foxglove, ROS tools and splatbot itself read.
+    """Write the frames of a camera, or a log, as one MCAP file of ROS 2 messages.
 
-    Nothing is rounded: mapping the file gives the trajectory that mapping the log gives. `splatbot convert-log` also
+    Foxglove, ROS tools and splatbot itself read it. Nothing is rounded: mapping the file gives the trajectory that
+    mapping the log gives. A camera is recorded until Ctrl-C, --seconds or --max-frames. `splatbot convert-log` also
     writes TUM folders.
 
     Examples:
+        splatbot record oak:// --out desk.mcap
+        splatbot record "realsense://?size=848x480&fps=30" --out desk.mcap --seconds 60
         splatbot record recordings/desk --out desk.mcap
         splatbot map desk.mcap
 
     Args:
-        log: a log, as for `splatbot map`.
+        log: a camera (oak://, realsense:// or replay:LOG, docs/guide/cameras.md), or a log, as for `splatbot map`.
         out: the file to write; must not exist.
         camera: intrinsics instead of the log's own, as for `splatbot map`.
+        seconds: with a camera, end after this time.
+        max_frames: with a camera, end after this number of frames.
+        quiet: no progress and no summary, only errors.
     """
-    log_kind(log)
-    check_camera(camera)
+    device = log.startswith(CAMERA_PREFIXES)
+    if device:
+        refuse_with_camera({"--camera": camera})
+    else:
+        log_kind(log)
+        check_camera(camera)
+        if seconds is not None or max_frames is not None:
+            raise InputError("is for cameras.", field="--seconds, --max-frames", hint="leave it out")
     check_output(out, folder=False)
     if out.exists():
         raise InputError("exists already.", file=out, field="--out", hint="choose another name")
 
-    from splatbot.logs import open_log
-    from splatbot.logs.mcap import record_mcap
+    if device:
+        text = _record_camera(log, out, seconds, max_frames, quiet)
+    else:
+        from splatbot.logs import open_log
+        from splatbot.logs.mcap import record_mcap
 
-    source = open_log(log, camera=camera)
-    record_mcap(source, out)
-    print(f"{out}: {len(source)} frames, {out.stat().st_size / 1e6:.1f} MB")
+        source = open_log(log, camera=camera)
+        record_mcap(source, out)
+        text = f"{len(source)} frames"
+    if not quiet:
+        print(f"{out}: {text}, {out.stat().st_size / 1e6:.1f} MB")
+
+
+def _record_camera(uri: str, out: Path, seconds: float | None, max_frames: int | None, quiet: bool) -> str:
+    """Record a camera until it ends or Ctrl-C, and describe the recording."""
+    recorded = open_recorded(uri, out, max_frames=max_frames, seconds=seconds)
+    begun = time.monotonic()
+    try:
+        with steps(quiet) as show:
+            for number, _ in recorded.arrivals():
+                elapsed = time.monotonic() - begun
+                show(f"recording: frame {number + 1}, {number / max(elapsed, 0.1):.1f} frames/s; Ctrl-C ends it")
+    except KeyboardInterrupt:
+        pass  # the normal end
+    finally:
+        recorded.close()
+    return f"{len(recorded)} frames in {time.monotonic() - begun:.1f} s"

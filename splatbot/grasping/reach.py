@@ -44,8 +44,7 @@ class Reached:
     Args:
         q: (J,) joint positions at the grasp. If None, the arm does not reach it.
         path: (K, J) path from the pre-grasp to the grasp.
-        T_world_pregrasp: (4, 4) pose of the tool at its start, which is farther back than requested where no plan may end
-            there.
+        T_world_pregrasp: (4, 4) pose of the tool at its start; farther back than requested where no plan may end there.
         clearance: minimum clearance of the arm along the path [m].
         limits: minimum distance to a joint limit as a fraction of half the joint's range, 0..1.
         reason: reason for which the grasp is not reachable; empty if it is.

@@ -59,15 +59,16 @@ class _Entry:
 class BagLog(StampedLog):
     """RGB-D frames of a recording of ROS topics; each depth image is paired with the colour image nearest in time.
 
-    Colour images without depth within 0.02 s are skipped and counted in ``unpaired``. If recorded, joint positions are
-    read from /joint_states, masks (white pixels are valid) from /camera/mask/image_raw and reference poses from
-    /ground_truth/pose. Frames are decoded on access; the file stays open. The class is not thread-safe.
+    Colour images without depth within ``pair_within`` are skipped and counted in ``unpaired``. If recorded, joint
+    positions are read from /joint_states, masks (white pixels are valid) from /camera/mask/image_raw and reference
+    poses from /ground_truth/pose. Frames are decoded on access; the file stays open. The class is not thread-safe.
 
     Args:
         path: the file or folder.
         camera: intrinsics that replace the recorded CameraInfo.
         topics: topics to read by the keys `color`, `depth`, `info` and `joints`, needed if the recording has several.
         joint_delay: time [s] by which the stamps of joint positions are later than their motion.
+        pair_within: largest difference [s] of the stamps of a pair.
 
     Raises:
         LogError: the file is missing or damaged, a topic is missing or ambiguous, or nothing can be paired.
@@ -81,8 +82,9 @@ class BagLog(StampedLog):
         camera: str | Path | Calibration | None = None,
         topics: dict[str, str] | None = None,
         joint_delay: float = 0.0,
+        pair_within: float = MAX_STAMP_DIFFERENCE_S,
     ) -> None:
-        self.path, self._joint_delay = Path(path), joint_delay
+        self.path, self._joint_delay, self._pair_within = Path(path), joint_delay, pair_within
         self._given = dict(topics or {})
         self.uri = str(path) + ("?" + "&".join(f"{k}={v}" for k, v in self._given.items()) if self._given else "")
         self.name = self.path.stem
@@ -249,10 +251,10 @@ class BagLog(StampedLog):
     def _pair(self) -> list[tuple[_Entry, _Entry]]:
         colors, depths = self._index[self._color], self._index[self._depth]
         a, b = (np.array([entry.stamp for entry in entries]) for entries in (colors, depths))
-        pairs = [(colors[i], depths[j]) for i, j in associate(a, b, MAX_STAMP_DIFFERENCE_S)]
+        pairs = [(colors[i], depths[j]) for i, j in associate(a, b, self._pair_within)]
         if not pairs:
             raise LogError(
-                f"no stamp of {self._depth} is within {MAX_STAMP_DIFFERENCE_S} s of one of {self._color}.",
+                f"no stamp of {self._depth} is within {self._pair_within:g} s of one of {self._color}.",
                 file=self.path,
                 field="stamps",
                 hint="record both with the same clock",

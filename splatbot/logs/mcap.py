@@ -12,6 +12,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 
 from splatbot.atomic import replace, sync
 from splatbot.errors import LogError
+from splatbot.frame import Frame
 from splatbot.logs.base import Log
 from splatbot.logs.mcap_storage import CheckedStorage, CheckedWriter, recover, write_checksums
 from splatbot.logs.record import Progress
@@ -98,17 +99,26 @@ def record_mcap(log: Log, path: str | Path, *, progress: Progress | None = None)
         for stamp, T in [] if truth is None else zip(truth.stamps.tolist(), truth.T_world_camera, strict=True):
             out.write(TRUTH, pose_stamped_message(stamp, T, "world"), _nanoseconds(stamp))
         for number, frame in enumerate(log, 1):
-            at = _nanoseconds(frame.stamp)
-            out.write(INFO, camera_info_message(frame.stamp, frame.camera), at)
-            out.write(COLOR, image_message(frame.stamp, frame.rgb), at)
-            out.write(DEPTH, image_message(frame.stamp + frame.depth_delay, frame.depth), at)
-            if frame.mask is not None:
-                out.write(MASK, image_message(frame.stamp, frame.mask), at)
-            if frame.joints is not None:
-                out.write(JOINTS, joint_state_message(frame.stamp, frame.joints, frame.joint_names), at)
+            write_frame(out, frame)
             if progress is not None:
                 progress(number)
     return out.path
+
+
+def write_frame(out: McapFile, frame: Frame) -> None:
+    """Add the intrinsics, images, mask and joints of a frame.
+
+    Raises:
+        OSError: the disk is full or not available.
+    """
+    at = _nanoseconds(frame.stamp)
+    out.write(INFO, camera_info_message(frame.stamp, frame.camera), at)
+    out.write(COLOR, image_message(frame.stamp, frame.rgb), at)
+    out.write(DEPTH, image_message(frame.stamp + frame.depth_delay, frame.depth), at)
+    if frame.mask is not None:
+        out.write(MASK, image_message(frame.stamp, frame.mask), at)
+    if frame.joints is not None:
+        out.write(JOINTS, joint_state_message(frame.stamp, frame.joints, frame.joint_names), at)
 
 
 def _nanoseconds(stamp: float) -> int:

@@ -53,6 +53,13 @@ class Interrupts:
         except KeyboardInterrupt:
             self.requested = self.requested or signal.SIGINT
 
+    def end_of_camera(self) -> bool:
+        """Return whether the only request is Ctrl-C, the normal end of a camera; it is then no longer pending."""
+        ended = self.requested == signal.SIGINT and self._count <= 1
+        if ended:
+            self.requested, self._count = None, 0
+        return ended
+
     def _handle(self, number: int, _frame: FrameType | None) -> None:
         self._count += 1
         self.requested = self.requested or number

@@ -10,13 +10,14 @@ from typing import Any, Literal
 from splatbot.config import Config, with_sensor
 from splatbot.errors import InputError, LogError
 from splatbot.logs import Log
+from splatbot.logs.live import RecordedCamera
 from splatbot.results.folder import RunFolder
 from splatbot.results.metrics import cost_metrics
 from splatbot.results.scoring import score_trajectory
 from splatbot.run.interrupts import Interrupts
 from splatbot.run.loop import FrameLoop
 from splatbot.run.outcome import MapPage, RunOutcome
-from splatbot.run.pacing import LogFrames, PacedSource
+from splatbot.run.pacing import CameraFrames, LogFrames, PacedSource
 from splatbot.run.progress import Progress
 from splatbot.run.saving import Saver, resume_loop
 from splatbot.run.state import Checkpoint, SavedRun
@@ -59,14 +60,15 @@ def map_log(
     map_page: MapPage | None = None,
     report: bool = True,
 ) -> RunResult:
-    """Map a log and write the run folder ``out``.
+    """Map a log, or a camera until it ends, and write the run folder ``out``.
 
     Every ``config.mapping.holdout_every``-th frame is tracked but kept out of the map, and the finished map is scored
     against it. Ctrl-C, SIGTERM and an unreadable frame end the mapping early. The map up to there is saved,
     scored and reported like a complete run. A second Ctrl-C skips scoring and report.
 
     Args:
-        log: the recording.
+        log: the recording, or a camera (:class:`splatbot.logs.live.RecordedCamera`). Ctrl-C is the normal end of a
+            camera; its frames come in real time.
         out: folder to write; files of an earlier run there are replaced once there is something to replace them with.
         config: configuration. If None, that of ``slam`` or the defaults apply.
         slam: the SLAM to run, without frames yet. If None, one is made from ``config``.
@@ -100,7 +102,7 @@ def map_log(
     config = config or (slam.config if slam else Config())
     if slam is None:
         config = with_sensor(config, log.calibration.sensor, file=log.calibration.file)
-    realtime = realtime or rate is not None
+    realtime = realtime or rate is not None or isinstance(log, RecordedCamera)
     if rate is not None and not 0 < rate < 1e4:
         raise InputError(f"is {rate}.", field="rate", hint="give frames per second, above 0")
     if realtime and slam is None:
@@ -108,11 +110,8 @@ def map_log(
         wall_clock = config.tracking.model_copy(update={"deterministic": False})
         config = config.model_copy(update={"mapping": threaded, "tracking": wall_clock})
     folder = RunFolder.create(out)
-    total = len(log) if max_frames is None else min(len(log), max_frames)
-    if total == 0:
-        raise LogError("has no frames.", file=log.name, hint="record the log again, or name another one")
     truth = log.ground_truth  # read now: a damaged file must not cost the user a whole run
-    frames = PacedSource(log, total, rate) if realtime else LogFrames(log, total)
+    frames = _frames(log, max_frames, realtime, rate)
     loop = FrameLoop(frames, slam or Slam(config), config, on_bad_frame, on_progress or (lambda _: None))
     if resume is not None:
         resume_loop(loop, resume)
@@ -154,3 +153,17 @@ def map_log(
     if loop.crash is not None:
         raise loop.crash
     return RunResult(folder.path, ended.metrics(), error=loop.error, signal=interrupts.requested)
+
+
+def _frames(log: Log, max_frames: int | None, realtime: bool, rate: float | None) -> LogFrames:
+    """Return the source of the frames.
+
+    Raises:
+        LogError: the log is empty.
+    """
+    if isinstance(log, RecordedCamera):
+        return CameraFrames(log)
+    total = len(log) if max_frames is None else min(len(log), max_frames)
+    if total == 0:
+        raise LogError("has no frames.", file=log.name, hint="record the log again, or name another one")
+    return PacedSource(log, total, rate) if realtime else LogFrames(log, total)

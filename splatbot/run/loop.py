@@ -107,6 +107,8 @@ class FrameLoop:
     def _all_frames(self, interrupts: Interrupts) -> bool:
         """Process all frames; return False if a signal or an unreadable frame ended the run.
 
+        Ctrl-C is the normal end of a camera.
+
         Raises:
             KeyboardInterrupt: A signal arrived during the wait for a frame, or a callback raised it.
         """
@@ -118,7 +120,7 @@ class FrameLoop:
                     return True
                 if not self._step(arrival):
                     return False
-        return False
+        return self.source.live and interrupts.end_of_camera()
 
     def _step(self, arrival: Arrival) -> bool:
         """Process one frame; False when the run ends here."""

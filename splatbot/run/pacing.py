@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from splatbot.errors import InputError
 from splatbot.frame import Frame
 from splatbot.logs import Log
+from splatbot.logs.live import RecordedCamera
 
 _MAX_DECODED = 8  # frames decoded in advance; the limit bounds memory
 
@@ -28,6 +29,7 @@ class LogFrames:
     """The first ``total`` frames of a log, on demand.
 
     Attributes:
+        total: number of frames to deliver; 0 if it is unknown.
         first: index of the first frame to deliver; a resumed run has processed the earlier ones.
         dropped: frames that were not delivered before a newer one arrived.
         late: frames that were still being processed when a newer one arrived.
@@ -44,6 +46,11 @@ class LogFrames:
     def pace(self) -> str | None:
         """Timing of the frames, for reports; None for frames on demand."""
         return None
+
+    @property
+    def live(self) -> bool:
+        """Return whether the frames come from a camera, which Ctrl-C ends."""
+        return False
 
     def __iter__(self) -> Generator[Arrival, None, None]:
         return (read(self.log, index) for index in range(self.first, self.total))
@@ -86,6 +93,34 @@ class PacedSource(LogFrames):
         if newer is None or not isinstance(newer.frame, Frame):  # an unreadable frame replaces no other
             return False
         return clock.due(newer) <= time.perf_counter()
+
+
+class CameraFrames(LogFrames):
+    """The frames of a camera that is recorded: the newest is delivered, older ones are dropped."""
+
+    log: RecordedCamera
+
+    def __init__(self, log: RecordedCamera) -> None:
+        super().__init__(log, total=0)
+
+    @property
+    def pace(self) -> str | None:
+        """Timing of the frames: that of the camera."""
+        return "by the camera"
+
+    @property
+    def live(self) -> bool:
+        """See :class:`LogFrames`."""
+        return True
+
+    def __iter__(self) -> Generator[Arrival, None, None]:
+        expected = 0
+        for index, frame in self.log.arrivals():
+            self.dropped.extend(range(expected, index))
+            yield Arrival(index, frame)
+            if len(self.log) > index + 1:
+                self.late.add(index)
+            expected = index + 1
 
 
 def read(log: Log, index: int) -> Arrival:

@@ -17,7 +17,7 @@ class Progress:
     Args:
         phase: current phase.
         done: frames read so far, of ``total``.
-        total: frames to read.
+        total: frames to read; 0 if it is unknown.
         elapsed_s: time since the first frame [s].
         result: result of the latest frame; None if it could not be read, and after the last.
         skipped: reason why the latest frame could not be read, "" otherwise.

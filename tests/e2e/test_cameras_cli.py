@@ -1,0 +1,87 @@
+"""`splatbot map` and `splatbot record` with a camera, at a pseudo-terminal."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatbot.cli import main
+from splatbot.logs import open_log
+from tests.terminal import at_a_terminal
+
+CAMERA = "replay:synthetic:tabletop?frames=400&width=160&height=120&speed=1"
+
+
+def test_ctrl_c_is_the_normal_end_of_a_mapped_camera(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    shown = at_a_terminal("map", CAMERA, "--out", str(out), "--no-report", columns=80, interrupt_at="mapping")
+    assert shown.code == 0, shown.text[-2000:]
+    assert "mapped" in shown.text
+    assert shown.longest_line() <= 80
+    metrics = json.loads((out / "metrics.json").read_text())
+    recording = open_log(out / "recording.mcap")
+    assert metrics["finished"]
+    assert not metrics["interrupted"]
+    assert metrics["log"]["uri"] == str(out / "recording.mcap")
+    assert metrics["frames"] == metrics["tracked"] >= 1
+    assert metrics["tracked"] + metrics["dropped"] <= len(recording) == metrics["log"]["frames"]
+
+
+def test_a_mapped_camera_is_its_recording_for_other_commands(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    assert main(["map", CAMERA, "--out", str(out), "--max-frames", "24", "--quiet"]) == 0
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["log"]["frames"] == 24
+    assert metrics["paced"] == "by the camera"
+    assert metrics["psnr_holdout_db"] > 25.0  # scored against frames of the recording
+    assert (out / "report.html").exists()
+    again = tmp_path / "again"
+    assert main(["map", str(out / "recording.mcap"), "--out", str(again), "--quiet", "--no-report"]) == 0
+    assert main(["eval", str(out)]) == 0
+    assert main(["map", CAMERA, "--out", str(out), "--max-frames", "3", "--quiet", "--no-report"]) == 2
+    assert main(["map", CAMERA, "--out", str(out), "--max-frames", "3", "--quiet", "--no-report", "--overwrite"]) == 0
+    assert len(open_log(out / "recording.mcap")) == 3
+
+
+def test_a_camera_that_is_lost_keeps_map_and_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "run"
+    assert main(["map", f"{CAMERA}&unplug=12", "--out", str(out), "--quiet", "--no-report"]) != 0
+    assert "is gone" in capsys.readouterr().err
+    assert (out / "map.ply").stat().st_size > 10_000
+    assert len(open_log(out / "recording.mcap")) == 12
+
+
+def test_a_recorded_camera_has_the_frames_of_the_camera(tmp_path: Path) -> None:
+    out = tmp_path / "a.mcap"
+    shown = at_a_terminal("record", CAMERA, "--out", str(out), columns=80, interrupt_at="frame 20,")
+    assert shown.code == 0, shown.text[-2000:]
+    recorded, source = open_log(out), open_log(CAMERA.removeprefix("replay:").partition("&speed")[0])
+    assert len(recorded) >= 20
+    np.testing.assert_array_equal(recorded[7].rgb, source[7].rgb)
+    np.testing.assert_array_equal(recorded[7].depth, source[7].depth)
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (["map", "oak://", "--robot", "panda"], "--robot"),
+        (["map", "oak://", "--camera", "tum_fr1"], "--camera"),
+        (["map", "oak://?size=3x3"], "width"),
+        (["map", "synthetic:tabletop", "--seconds", "3"], "--seconds"),
+        (["record", "synthetic:tabletop", "--out", "a.mcap", "--max-frames", "3"], "--max-frames"),
+        (["record", CAMERA, "--out", "a.mcap", "--seconds", "nan"], "--seconds"),
+        (["record", "oak://", "--out", "a.mcap"], "USB 3"),
+    ],
+)
+def test_a_wrong_use_is_one_sentence_and_writes_nothing(
+    words: list[str], named: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(words) != 0
+    error = capsys.readouterr().err
+    assert error.startswith("error: ")
+    assert named in error
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,122 @@
+"""A camera that is recorded while it is read."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatbot.errors import DeviceError, LogError
+from splatbot.frame import Frame
+from splatbot.logs import open_log
+from splatbot.logs.live import RecordedCamera
+from splatbot.robots.cameras import ReplayCamera
+from splatbot.robots.cameras.replay import ReplayOptions
+from tests.conftest import MakeLog
+
+
+class GivenFrames:
+    """A camera that delivers given frames at once."""
+
+    name, uri = "given", "given://"
+
+    def __init__(self, frames: list[Frame]) -> None:
+        self._frames = frames
+
+    def __iter__(self) -> Iterator[Frame]:
+        return iter(self._frames)
+
+    def close(self) -> None:
+        pass
+
+
+def test_a_slow_reader_misses_frames_but_the_recording_has_all(make_log: MakeLog, tmp_path: Path) -> None:
+    source = open_log(make_log(12, period=0.05))
+    recorded = RecordedCamera(ReplayCamera(source), tmp_path / "a.mcap")
+    numbers = []
+    for number, frame in recorded.arrivals():
+        np.testing.assert_array_equal(frame.depth, source[number].depth)
+        numbers.append(number)
+        time.sleep(0.12)
+    assert numbers == sorted(set(numbers))
+    assert len(numbers) < 12
+    assert numbers[-1] == 11
+    assert len(recorded) == 12
+    for k, (own, read) in enumerate(zip(source, open_log(tmp_path / "a.mcap"), strict=True)):
+        for frame in (recorded[k], read):
+            np.testing.assert_array_equal(frame.rgb, own.rgb)
+            np.testing.assert_array_equal(frame.depth, own.depth)
+            assert frame.stamp == pytest.approx(own.stamp, abs=1e-9)
+
+
+def test_frames_of_any_delay_between_colour_and_depth_keep_their_numbers(make_log: MakeLog, tmp_path: Path) -> None:
+    frames = [replace(frame, depth_delay=0.045) for frame in open_log(make_log(5, period=0.1))]
+    recorded = RecordedCamera(GivenFrames(frames), tmp_path / "a.mcap")
+    list(recorded.arrivals())
+    assert len(recorded) == 5
+    for k, frame in enumerate(frames):
+        assert recorded[k].depth_delay == pytest.approx(0.045, abs=1e-9)
+        np.testing.assert_array_equal(recorded[k].depth, frame.depth)
+
+
+def test_it_ends_after_a_number_of_frames_or_seconds(make_log: MakeLog, tmp_path: Path) -> None:
+    log = open_log(make_log(20, period=0.05))
+    three = RecordedCamera(ReplayCamera(log), tmp_path / "a.mcap", max_frames=3)
+    list(three.arrivals())
+    assert len(three) == len(open_log(tmp_path / "a.mcap")) == 3
+    brief = RecordedCamera(ReplayCamera(log), tmp_path / "b.mcap", seconds=0.3)
+    list(brief.arrivals())
+    assert 4 <= len(brief) <= 12
+
+
+def test_frames_up_to_the_loss_of_the_device_are_kept(make_log: MakeLog, tmp_path: Path) -> None:
+    camera = ReplayCamera(open_log(make_log(8, period=0.02)), ReplayOptions(unplug=5))
+    recorded = RecordedCamera(camera, tmp_path / "a.mcap")
+    with pytest.raises(DeviceError, match="gone"):
+        list(recorded.arrivals())
+    assert len(open_log(tmp_path / "a.mcap")) == 5
+
+
+def test_frames_whose_stamps_do_not_increase_are_left_out(
+    make_log: MakeLog, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    frames = list(open_log(make_log(4)))
+    again = [frames[0], frames[1], frames[1], frames[0], frames[2], frames[3]]
+    with caplog.at_level(logging.WARNING):
+        recorded = RecordedCamera(GivenFrames(again), tmp_path / "a.mcap")
+        list(recorded.arrivals())
+    assert len(recorded) == len(open_log(tmp_path / "a.mcap")) == 4
+    assert caplog.text.count("left out") == 2
+
+
+def test_images_of_another_camera_end_it_with_its_recording_kept(make_log: MakeLog, tmp_path: Path) -> None:
+    frames = list(open_log(make_log(3)))
+    frames[2] = replace(frames[2], camera=replace(frames[2].camera, fx=99.0))
+    recorded = RecordedCamera(GivenFrames(frames), tmp_path / "a.mcap")
+    with pytest.raises(LogError, match="changed"):
+        list(recorded.arrivals())
+    assert len(open_log(tmp_path / "a.mcap")) == 2
+
+
+def test_a_camera_without_frames_and_an_existing_file_are_refused(make_log: MakeLog, tmp_path: Path) -> None:
+    with pytest.raises(LogError, match="first frame"):
+        RecordedCamera(GivenFrames([]), tmp_path / "a.mcap")
+    assert not (tmp_path / "a.mcap").exists()
+    (tmp_path / "b.mcap").touch()
+    with pytest.raises(LogError, match="exists"):
+        RecordedCamera(GivenFrames(list(open_log(make_log(1)))), tmp_path / "b.mcap")
+
+
+def test_a_frame_is_readable_only_when_the_recording_ended(make_log: MakeLog, tmp_path: Path) -> None:
+    recorded = RecordedCamera(ReplayCamera(open_log(make_log(4, period=0.1))), tmp_path / "a.mcap")
+    arrivals = recorded.arrivals()
+    next(arrivals)
+    with pytest.raises(LogError, match="being recorded"):
+        recorded[0]
+    recorded.close()
+    assert recorded[0].index == 0
