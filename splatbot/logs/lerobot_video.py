@@ -19,6 +19,7 @@ from splatbot.logs.images import depth_in_metres
 _CODE_BITS = 12
 _LAST_CODE = 4095
 _AHEAD = 1.0  # [s] that are decoded on the way to a later frame; beyond it, the nearest key frame is sought
+_BACK = 1.0  # [s] within which frames are stored out of order
 _PADDING = 128  # [px] by which coded images may be larger
 _AGAIN = "copy or download the dataset again"
 
@@ -85,6 +86,7 @@ class VideoFrames:
             hint = "give the intrinsics of this image size"
             raise LogError(problem, file=path, field="image size", hint=hint)
         most = (size[0] + _PADDING) * (size[1] + _PADDING)
+        self._stream.codec_context.thread_count = 1  # with more, an error takes frames with it that precede it
         self._stream.codec_context.options = {"max_pixels": str(most), "err_detect": "explode"}
         self._frames: Iterator[tuple[float, VideoFrame]] = iter(())
         self._current: tuple[float, VideoFrame] | None = None
@@ -128,8 +130,11 @@ class VideoFrames:
         earliest, latest = time - self._tolerance, time + self._tolerance
         current = self._current
         if current is None or not earliest - _AHEAD <= current[0] <= latest:
-            self._seek(earliest)
-            current = next(self._frames)
+            self._seek(latest)
+            current = next(self._frames, None)
+            if current is None or current[0] > latest:  # the key frame found is stored before, yet shown after it
+                self._seek(latest - _BACK)
+                current = next(self._frames)
         while current[0] < earliest:
             current = next(self._frames)
         self._current = current
@@ -140,5 +145,15 @@ class VideoFrames:
         if base is None:
             raise ValueError("the video has no clock")
         self._container.seek(max(0, int(time / base)), stream=self._stream, backward=True)
-        decoded = self._container.decode(self._stream)
-        self._frames = ((frame.time, frame) for frame in decoded if frame.time is not None)
+        self._frames = ((float(f.pts * base), f) for f in self._decode() if f.pts is not None)
+
+    def _decode(self) -> Iterator[VideoFrame]:
+        """Decode the frames from the current position; those before a damaged one precede its error."""
+        decoder = self._stream.codec_context
+        for packet in self._container.demux(self._stream):
+            try:
+                frames = decoder.decode(packet)
+            except av.FFmpegError:
+                yield from decoder.decode(None)
+                raise
+            yield from frames
