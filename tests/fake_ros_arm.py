@@ -34,6 +34,7 @@ class Behaviour:
         lag: time constant of the arm [s].
         reject: goals are rejected.
         silent: goals get no answer, and have no effect.
+        late_s: time after which a goal begins.
         abort_at, stall_at, drop_at: the goal is aborted, joint states end, all connections are cut.
         down_s: time without a server after a cut.
         blocks: a connection is not read while its goal runs, as by rosbridge without goals in new threads.
@@ -45,6 +46,7 @@ class Behaviour:
     lag: float = 0.0
     reject: bool = False
     silent: bool = False
+    late_s: float = 0.0
     abort_at: float = np.inf
     stall_at: float = np.inf
     drop_at: float = np.inf
@@ -188,6 +190,8 @@ class FakeRosArm:
         )
         goal_time = self._seconds(args["goal_time_tolerance"])
         goal = Goal(name, socket, times, points, path, end, goal_time, time.monotonic())
+        time.sleep(self.behaviour.late_s)
+        goal.started = time.monotonic()
         with self._lock:
             self.commands.clear()
             self._goal = goal

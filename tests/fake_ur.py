@@ -98,6 +98,9 @@ class _Control(_Interface):
         self.arm.servo(target, time)
         return not self.arm.refuses
 
+    def stopScript(self) -> None:
+        self.arm.running = False
+
     def servoStop(self, a: float = 10.0) -> bool:
         self.arm.calls.append(("servoStop", a))
         self.arm.halt()

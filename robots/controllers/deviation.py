@@ -29,7 +29,7 @@ class Deviation:
 
 
 @dataclass(frozen=True, eq=False)
-class Knots:
+class GoalPoints:
     """Points of a trajectory message, at the knots of a certified curve.
 
     A quintic with the positions, velocities and accelerations of a cubic at both ends is that cubic. Controllers that
@@ -46,7 +46,7 @@ class Knots:
     acceleration: Array
 
     @classmethod
-    def of(cls, pieces: CubicPieces) -> Knots:
+    def of(cls, pieces: CubicPieces) -> GoalPoints:
         """Return the points at the knots of a curve.
 
         Raises:
@@ -75,7 +75,7 @@ def between_set_points(pieces: CubicPieces, reach: Array, period: float) -> Devi
     return _largest(period**2 / 8.0 * pieces.acceleration, reach)
 
 
-def of_quintics(pieces: CubicPieces, knots: Knots, reach: Array) -> Deviation:
+def of_quintics(pieces: CubicPieces, points: GoalPoints, reach: Array) -> Deviation:
     """Bound the deviation of the quintics between the points of a message from the certified curve.
 
     Both are polynomials of degree 5 in the fraction of a piece. Their difference lies in the convex hull of its
@@ -83,13 +83,17 @@ def of_quintics(pieces: CubicPieces, knots: Knots, reach: Array) -> Deviation:
 
     Args:
         pieces: the certified curve.
-        knots: one point for each knot of the curve.
+        points: one for each knot of the curve.
         reach: (K, J), see :attr:`splatbot.collision.RobotSpheres.reach`.
     """
     v0, v1 = pieces.velocities()
     certified = _bernstein(np.diff(pieces.time), pieces.position, v0, v1, pieces.acceleration)
     sent = _bernstein(
-        1e-9 * np.diff(knots.nanoseconds), knots.position, knots.velocity[:-1], knots.velocity[1:], knots.acceleration
+        1e-9 * np.diff(points.nanoseconds),
+        points.position,
+        points.velocity[:-1],
+        points.velocity[1:],
+        points.acceleration,
     )
     return _largest((sent - certified).reshape(-1, reach.shape[1]), reach)
 

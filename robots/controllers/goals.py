@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from splatbot.robots.controllers.deviation import Knots
+from splatbot.robots.controllers.deviation import GoalPoints
 from splatbot.robots.controllers.live import LiveOptions
 from splatbot.robots.controllers.rosbridge import Operation
 
@@ -51,7 +51,7 @@ class ActionDialect(Protocol):
         """Return the operations that begin the second connection."""
         ...
 
-    def send(self, goal: str, knots: Knots, names: tuple[str, ...], options: LiveOptions) -> Operation:
+    def send(self, goal: str, points: GoalPoints, names: tuple[str, ...], options: LiveOptions) -> Operation:
         """Return the operation that sends a goal."""
         ...
 
@@ -86,9 +86,9 @@ class Ros2Action:
         """Return no operation: the service that cancels needs none."""
         return []
 
-    def send(self, goal: str, knots: Knots, names: tuple[str, ...], options: LiveOptions) -> Operation:
+    def send(self, goal: str, points: GoalPoints, names: tuple[str, ...], options: LiveOptions) -> Operation:
         """Return ``send_action_goal`` with feedback."""
-        args = _goal(knots, names, options, ("sec", "nanosec"))
+        args = _goal(points, names, options, ("sec", "nanosec"))
         kind = "control_msgs/action/FollowJointTrajectory"
         operation = {"op": "send_action_goal", "id": goal, "action": self._action, "action_type": kind}
         return operation | {"feedback": True, "args": args}
@@ -142,9 +142,9 @@ class Ros1Action:
         """Return the announcement of cancellations."""
         return [self._cancels()]
 
-    def send(self, goal: str, knots: Knots, names: tuple[str, ...], options: LiveOptions) -> Operation:
+    def send(self, goal: str, points: GoalPoints, names: tuple[str, ...], options: LiveOptions) -> Operation:
         """Return the publication of a goal."""
-        args = _goal(knots, names, options, ("secs", "nsecs"))
+        args = _goal(points, names, options, ("secs", "nsecs"))
         now = {"secs": 0, "nsecs": 0}
         message = {"header": {"stamp": now, "frame_id": ""}, "goal_id": {"stamp": now, "id": goal}, "goal": args}
         return {"op": "publish", "topic": f"{self._action}/goal", "msg": message}
@@ -176,18 +176,18 @@ class Ros1Action:
         return {"op": "advertise", "topic": f"{self._action}/{part}", "type": kind}
 
 
-def _goal(knots: Knots, names: tuple[str, ...], options: LiveOptions, clock: tuple[str, str]) -> dict[str, Any]:
+def _goal(points: GoalPoints, names: tuple[str, ...], options: LiveOptions, clock: tuple[str, str]) -> dict[str, Any]:
     """Return a FollowJointTrajectory goal; ``clock`` names seconds and nanoseconds."""
 
     def duration(nanoseconds: int) -> dict[str, int]:
         return dict(zip(clock, divmod(nanoseconds, 10**9), strict=True))
 
-    rows = (knots.position, knots.velocity, knots.acceleration, knots.nanoseconds)
-    points = [
+    rows = (points.position, points.velocity, points.acceleration, points.nanoseconds)
+    messages = [
         {"positions": q, "velocities": v, "accelerations": a, "effort": [], "time_from_start": duration(t)}
         for q, v, a, t in zip(*(row.tolist() for row in rows), strict=True)
     ]
-    trajectory = {"header": {"stamp": duration(0), "frame_id": ""}, "joint_names": list(names), "points": points}
+    trajectory = {"header": {"stamp": duration(0), "frame_id": ""}, "joint_names": list(names), "points": messages}
     return {
         "trajectory": trajectory,
         "path_tolerance": _tolerances(names, options.path_tolerance),

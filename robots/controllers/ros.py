@@ -12,14 +12,14 @@ import numpy as np
 from splatbot.errors import ControllerError, DeviceError, InputError
 from splatbot.planning.certify import CertifiedMotion
 from splatbot.protocols import RobotKinematics
-from splatbot.robots.controllers.deviation import Deviation, Knots, of_quintics
+from splatbot.robots.controllers.arm_states import ArmStates
+from splatbot.robots.controllers.deviation import Deviation, GoalPoints, of_quintics
 from splatbot.robots.controllers.goals import ActionDialect, GoalNews, Ros1Action, Ros2Action
-from splatbot.robots.controllers.joint_states import JointStates
 from splatbot.robots.controllers.live import LiveController, LiveOptions, Measured
 from splatbot.robots.controllers.rosbridge import Operation, RosbridgeLink
 
 _PERIOD_S = 0.01
-_ACCEPT_S = 3.0  # [s] in which a goal must be accepted
+_ACCEPT_S = 2.0  # [s] in which a goal must be accepted
 _SETTLE_S = 1.0  # [s] in which the joint states must show that the arm rests
 _MAX_POINTS = 10_000  # of one goal: some 5 MB, where rosbridge_server takes 10 MB
 _DIALECTS: dict[int, type[Ros1Action] | type[Ros2Action]] = {1: Ros1Action, 2: Ros2Action}
@@ -29,7 +29,7 @@ class RosController(LiveController):
     """A :class:`splatbot.protocols.Controller` that sends each motion as one FollowJointTrajectory goal.
 
     The points of the goal are the knots of the certified curve with velocities and accelerations. The quintics between
-    them are the curve itself (:class:`splatbot.robots.controllers.deviation.Knots`). The robot's controller executes
+    them are the curve itself (:class:`splatbot.robots.controllers.deviation.GoalPoints`). The robot's controller executes
     the goal without this process: a motion goes on if the connection is lost. It is then a fault at once, and the goal
     is cancelled as soon as the connection is back.
 
@@ -61,9 +61,9 @@ class RosController(LiveController):
             raise InputError(f"is {ros}.", field="ros", hint="give 1 or 2")
         self._dialect: ActionDialect = _DIALECTS[ros](action)
         self._action, self._topic = action, states
-        self._states = JointStates(robot.chain.names)
+        self._states = ArmStates(robot.chain.names)
         self._goal: str | None = None  # that may still run
-        self._active = False
+        self._active = self._cancelling = False
         self._result: GoalNews | None = None
         self._news = threading.Condition()
         self._begun, self._losses = 0.0, 0
@@ -92,17 +92,17 @@ class RosController(LiveController):
         if len(pieces) >= _MAX_POINTS:
             text = f"has {len(pieces) + 1} knots, more than {_MAX_POINTS}."
             raise ControllerError(text, field="motion", hint="send it in parts")
-        return super().deviation(motion) + of_quintics(pieces, Knots.of(pieces), motion.arm.reach)
+        return super().deviation(motion) + of_quintics(pieces, GoalPoints.of(pieces), motion.arm.reach)
 
     def _begin(self, motion: CertifiedMotion) -> None:
         self._losses = self._total_losses
         goal = uuid4().hex
         with self._news:
-            self._goal, self._active, self._result = goal, False, None
-        knots = Knots.of(motion.motion.pieces())
+            self._goal, self._active, self._cancelling, self._result = goal, False, False, None
+        points = GoalPoints.of(motion.motion.pieces())
         self._begun = time.monotonic()
         try:
-            self._goals.send(self._dialect.send(goal, knots, self.robot.chain.names, self.options))
+            self._goals.send(self._dialect.send(goal, points, self.robot.chain.names, self.options))
             with self._news:
                 self._news.wait_for(lambda: self._active or self._result is not None, _ACCEPT_S)
             self._check_link()
@@ -130,11 +130,15 @@ class RosController(LiveController):
         return bool(distance <= self.options.start_tolerance)
 
     def _abort(self) -> None:
-        """Cancel the goal on both connections; the second one works although the first one may wait for the goal."""
-        if self._goal is None:
+        """Cancel the goal on both connections, and again with each of its feedbacks.
+
+        The second connection works while the first one waits for the goal. Its cancellation may overtake the goal.
+        """
+        self._cancelling = True
+        if (goal := self._goal) is None:
             return
         with suppress(DeviceError):
-            self._goals.send(self._dialect.cancel(self._goal))
+            self._goals.send(self._dialect.cancel(goal))
         self._reports.send(self._dialect.cancel_all())
 
     def _await_rest(self) -> None:
@@ -192,3 +196,6 @@ class RosController(LiveController):
             else:
                 self._active = True
             self._news.notify_all()
+        if self._cancelling:
+            with suppress(DeviceError):
+                self._abort()

@@ -73,7 +73,9 @@ class RosbridgeLink:
         self._ended.set()
         if (socket := self._socket) is not None:
             socket.close()
-        self._thread.join(_OPEN_S)
+        self._thread.join(2.0 * _OPEN_S)
+        if (socket := self._socket) is not None:  # opened again meanwhile
+            socket.close()
 
     def _lost(self) -> DeviceError:
         return DeviceError("is not connected.", field=self._address, hint="check the network and rosbridge_server")

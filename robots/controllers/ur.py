@@ -85,6 +85,7 @@ class UrController(LiveController):
         with suppress(ControllerError):
             if self._steps:
                 self._abort()
+            self._call(self._control.stopScript)
         for interface in (self._control, self._receive):
             interface.disconnect()
 

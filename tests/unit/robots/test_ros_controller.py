@@ -15,15 +15,20 @@ import pytest
 
 from splatbot.collision import RobotSpheres
 from splatbot.errors import ControllerError, DeviceError, InputError
+from splatbot.grasping.pick import Picker
+from splatbot.grasping.pick_types import PickOutcome
 from splatbot.planning import CertifiedMotion, JointTrajectory, WaypointMotion, certify_motion, time_path
 from splatbot.planning.cubics import CubicPieces
 from splatbot.planning.follow import follow
 from splatbot.protocols import Array, Controller, MotionState
-from splatbot.robots.controllers.deviation import Knots, between_set_points, of_quintics
+from splatbot.robots.controllers.arm_states import ArmStates
+from splatbot.robots.controllers.deviation import GoalPoints, between_set_points, of_quintics
 from splatbot.robots.controllers.live import LiveOptions
 from splatbot.robots.controllers.ros import RosController
+from splatbot.robots.grippers import FakeGripper
 from splatbot.robots.store import load_robot
 from tests.fake_ros_arm import Behaviour, FakeRosArm, quintic
+from tests.unit.grasping.test_pick import OPTIONS, grasps, sampler, target
 from tests.unit.planning.test_timing import path_of
 from tests.waiting import until
 
@@ -135,7 +140,7 @@ def test_straight_lines_between_set_points_stay_within_their_bound(trajectory: J
 
 def test_quintics_through_wrong_points_stay_within_their_bound(trajectory: JointTrajectory) -> None:
     pieces = trajectory.pieces()
-    exact = Knots.of(pieces)
+    exact = GoalPoints.of(pieces)
     assert of_quintics(pieces, exact, ARM.reach).sphere < 1e-9
     rng = np.random.default_rng(3)
     for size in (1e-6, 1e-3, 0.1):
@@ -236,9 +241,19 @@ def test_a_rejected_goal_is_refused_with_its_reason(motion: CertifiedMotion, ros
 
 def test_a_goal_without_an_answer_is_cancelled_and_refused(motion: CertifiedMotion) -> None:
     with connected(silent=True) as (controller, arm):
-        with pytest.raises(ControllerError, match="did not begin within 3 s"):
+        with pytest.raises(ControllerError, match="did not begin within 2 s"):
             controller.send(motion)
         until(lambda: arm.cancels >= 1, 2.0)
+
+
+def test_a_goal_that_begins_after_it_was_given_up_is_cancelled_again(slow: CertifiedMotion) -> None:
+    with connected(late_s=2.3, blocks=True) as (controller, arm):
+        with pytest.raises(ControllerError, match="did not begin"):
+            controller.send(slow)
+        before = arm.cancels  # the first one comes before the goal begins
+        until(lambda: arm.commands and arm.cancels > before, 3.0)
+        time.sleep(0.1)
+        assert stands(arm)
 
 
 @pytest.mark.parametrize("ros", [1, 2])
@@ -318,6 +333,36 @@ def test_a_success_that_the_joint_states_deny_is_no_arrival(slow: CertifiedMotio
             pass
         assert feedback.state is MotionState.DONE
         np.testing.assert_allclose(feedback.position, slow.reference(slow.duration)[0], atol=0.011)
+
+
+def test_states_of_another_clock_count_after_a_lost_connection_alone() -> None:
+    def state(sec: int, q: float) -> dict[str, Any]:
+        return {"header": {"stamp": {"sec": sec, "nanosec": 0}}, "name": ["b", "a"], "position": [q, 0.0]}
+
+    def position() -> list[float]:
+        latest = states.latest()
+        assert latest is not None
+        return latest[0].tolist()
+
+    states = ArmStates(("a", "b"))
+    assert states.age == np.inf
+    assert states.latest() is None
+    states.take(state(1000, 1.0))
+    states.take(state(5, 2.0))
+    assert position() == [0.0, 1.0]
+    states.restart()
+    states.take(state(5, 2.0))
+    assert position() == [0.0, 2.0]
+    states.take(state(4, 3.0))
+    assert position() == [0.0, 2.0]
+
+
+def test_a_pick_is_executed_goal_by_goal() -> None:
+    with connected(lag=0.005) as (controller, arm):
+        picker = Picker(sampler(), controller, FakeGripper(width=0.06), options=OPTIONS)
+        result = picker.pick(target("can"), grasps=grasps("can"))
+        assert result.outcome is PickOutcome.PICKED, result.reason
+        assert len(arm.goals) == 4  # to the pre-grasp, the approach, and two parts of the lift
 
 
 def test_messages_without_sense_have_no_effect(motion: CertifiedMotion) -> None:

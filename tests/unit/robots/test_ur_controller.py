@@ -178,6 +178,7 @@ def test_a_slow_rate_needs_a_margin(arm: FakeUr, trajectory: JointTrajectory) ->
 def test_connections_end_and_a_wrong_address_or_option_is_named(arm: FakeUr) -> None:
     UrController("ur", UR5E).close()
     assert arm.disconnected == 2
+    assert not arm.running
     with pytest.raises(DeviceError, match=r"cannot be reached.*remote control"):
         UrController("192.0.2.1", UR5E)
     with pytest.raises(InputError, match="7 joints"):

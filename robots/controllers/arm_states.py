@@ -26,7 +26,7 @@ class _Sample:
     velocity: Array | None
 
 
-class JointStates:
+class ArmStates:
     """The latest states of an arm's joints. Messages may have any order of names, and other joints.
 
     A message without all joints, with values that are not finite, or with a stamp that is not after the one before has
