@@ -88,13 +88,8 @@ def of_quintics(pieces: CubicPieces, points: GoalPoints, reach: Array) -> Deviat
     """
     v0, v1 = pieces.velocities()
     certified = _bernstein(np.diff(pieces.time), pieces.position, v0, v1, pieces.acceleration)
-    sent = _bernstein(
-        1e-9 * np.diff(points.nanoseconds),
-        points.position,
-        points.velocity[:-1],
-        points.velocity[1:],
-        points.acceleration,
-    )
+    h, v = 1e-9 * np.diff(points.nanoseconds), points.velocity
+    sent = _bernstein(h, points.position, v[:-1], v[1:], points.acceleration)
     return _largest((sent - certified).reshape(-1, reach.shape[1]), reach)
 
 

@@ -29,9 +29,10 @@ class RosController(LiveController):
     """A :class:`splatbot.protocols.Controller` that sends each motion as one FollowJointTrajectory goal.
 
     The points of the goal are the knots of the certified curve with velocities and accelerations. The quintics between
-    them are the curve itself (:class:`splatbot.robots.controllers.deviation.GoalPoints`). The robot's controller executes
-    the goal without this process: a motion goes on if the connection is lost. It is then a fault at once, and the goal
-    is cancelled as soon as the connection is back.
+    them are the curve itself (:class:`splatbot.robots.controllers.deviation.GoalPoints`).
+
+    The robot's controller executes the goal without this process: a motion goes on if the connection is lost. It is
+    then a fault at once, and the goal is cancelled as soon as the connection is back.
 
     Args:
         address: of rosbridge, ``ws://host:9090``.
