@@ -24,7 +24,7 @@ _LAYOUTS_HINT = (
     "`synthetic:tabletop` needs no files"
 )
 _FILES: dict[str, LogKind] = {".mcap": "bag", ".bag": "bag", ".sens": "scannet", ".r3d": "record3d"}
-_WITH_OPTIONS = ("bag", "lerobot")  # kinds whose path may be followed by ?KEY=VALUE&KEY=VALUE
+_WITH_OPTIONS = ("bag", "lerobot", "tum")  # kinds whose path may be followed by ?KEY=VALUE&KEY=VALUE
 _HEAD = 2**20  # bytes of a JSON file that hold its description, or its first frames
 _AS_TUM = "write rgb/, depth/ (16-bit PNG), rgb.txt, depth.txt and intrinsics.json (docs/guide/mapping.md)"
 _FROM_A_LOG = f"map a recording; splatbot reads files of Gaussians ({', '.join(MAP_SUFFIXES)})"

@@ -68,7 +68,8 @@ def map_log_command(
 
     Args:
         log: a folder in TUM or Replica layout, a recording of ROS topics (.mcap, rosbag2 folder, .bag), or
-            synthetic:SCENE?... (see splatbot simulate --list). A camera is oak://, realsense:// or replay:LOG
+            synthetic:SCENE?... (see splatbot simulate --list). `LOG?pair_within=0.05` pairs colour and depth up to
+            0.05 s apart (0.02 s by default). A camera is oak://, realsense:// or replay:LOG
             (docs/guide/cameras.md).
         out: folder to write; by default runs/NAME-TIME, with a link runs/latest.
         config: YAML file; environment variables (SPLATBOT_MAPPING__MAX_GAUSSIANS=...) and then --set override it.

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from splatbot.errors import LogError
 from splatbot.layouts import LogKind, log_kind
+from splatbot.logs.address import PAIR_WITHIN, split_address
 from splatbot.logs.base import Log
 from splatbot.logs.calibration import Calibration
 from splatbot.logs.image_folder import ImageFolderLog
@@ -41,7 +42,8 @@ def open_log(
         uri: a folder in TUM, Replica, 7-Scenes, Open3D, ScanNet or Nerfstudio layout, or a `.sens` or `.r3d` file. A
             recording of ROS topics is an `.mcap`, a rosbag2 folder or a `.bag`. Select one of several cameras by
             `FILE?color=TOPIC&depth=TOPIC&info=TOPIC`. In a LeRobot dataset, `FOLDER?episode=N&color=KEY&depth=KEY`
-            selects an episode and a camera. Generated logs have the form
+            selects an episode and a camera. In TUM folders and recordings of ROS topics, `?pair_within=0.05` is the
+            largest difference [s] of the stamps of colour and depth, 0.02 by default. Generated logs have the form
             `synthetic:SCENE?trajectory=NAME&frames=N&effects=SPEC;SPEC&...` with the keys of
             :class:`splatbot.logs.synthetic.SyntheticOptions`.
         camera: a preset (tum_fr1, tum_fr2, tum_fr3), an `intrinsics.json` or a calibration that replaces the log's own.
@@ -62,7 +64,8 @@ def open_log(
     if kind == "lerobot":
         return _open_lerobot(str(uri), camera, joint_delay)
     if kind == "tum":
-        return TumLog(Path(uri), camera=camera, missing=missing, joint_delay=joint_delay)
+        folder, options = split_address(str(uri), (PAIR_WITHIN,))
+        return TumLog(folder, camera=camera, missing=missing, joint_delay=joint_delay, options=options)
     return _FOLDERS[kind](Path(uri), camera=camera)
 
 
@@ -73,19 +76,19 @@ def _open_synthetic(uri: str) -> Log:
 
 
 def _open_bag(uri: str, camera: str | Path | Calibration | None, joint_delay: float) -> Log:
-    from splatbot.logs.bag import BagLog, split_query  # rosbags builds its message classes when imported
+    from splatbot.logs.bag import KEYS, BagLog  # rosbags builds its message classes when imported
 
-    path, topics = split_query(uri)
-    return BagLog(path, camera=camera, topics=topics, joint_delay=joint_delay)
+    path, options = split_address(uri, KEYS)
+    return BagLog(path, camera=camera, options=options, joint_delay=joint_delay)
 
 
 def _open_lerobot(uri: str, camera: str | Path | Calibration | None, joint_delay: float) -> Log:
     from splatbot.logs.lerobot_packages import require_lerobot
 
     require_lerobot(uri)
-    from splatbot.logs.lerobot import LeRobotLog, split_query  # imports the optional packages pyarrow and av
+    from splatbot.logs.lerobot import OPTIONS, LeRobotLog  # imports the optional packages pyarrow and av
 
-    folder, options = split_query(uri)
+    folder, options = split_address(uri, OPTIONS)
     return LeRobotLog(folder, options=options, camera=camera, joint_delay=joint_delay)
 
 

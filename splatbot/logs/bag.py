@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from rosbags.interfaces import Connection
 from splatbot.camera import Camera
 from splatbot.errors import InputError, LogError
 from splatbot.frame import Frame
+from splatbot.logs.address import PAIR_WITHIN, join_address, seconds_of_option
 from splatbot.logs.base import MILLIMETRES, StampedLog
 from splatbot.logs.calibration import Calibration
 from splatbot.logs.index import MAX_STAMP_DIFFERENCE_S, associate
@@ -40,7 +41,7 @@ from splatbot.logs.streams import bag_streams, header_stamp, obstacle_to_mapping
 from splatbot.logs.undistort import Undistorter
 from splatbot.trajectory import Trajectory
 
-KEYS = ("color", "depth", "info", "joints")
+KEYS = ("color", "depth", "info", "joints", PAIR_WITHIN)
 _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _T = TypeVar("_T")
 
@@ -59,16 +60,17 @@ class _Entry:
 class BagLog(StampedLog):
     """RGB-D frames of a recording of ROS topics; each depth image is paired with the colour image nearest in time.
 
-    Colour images without depth within ``pair_within`` are skipped and counted in ``unpaired``. If recorded, joint
-    positions are read from /joint_states, masks (white pixels are valid) from /camera/mask/image_raw and reference
-    poses from /ground_truth/pose. Frames are decoded on access; the file stays open. The class is not thread-safe.
+    Colour images without depth within 0.02 s, or the option `pair_within`, are skipped and counted in ``unpaired``. If
+    recorded, joint positions are read from /joint_states, masks (white pixels are valid) from /camera/mask/image_raw
+    and reference poses from /ground_truth/pose. Frames are decoded on access; the file stays open. The class is not
+    thread-safe.
 
     Args:
         path: the file or folder.
         camera: intrinsics that replace the recorded CameraInfo.
-        topics: topics to read by the keys `color`, `depth`, `info` and `joints`, needed if the recording has several.
+        options: topics to read by the keys `color`, `depth`, `info` and `joints`, needed if the recording has several.
+            `pair_within` is the largest difference [s] of the stamps of a pair.
         joint_delay: time [s] by which the stamps of joint positions are later than their motion.
-        pair_within: largest difference [s] of the stamps of a pair.
 
     Raises:
         LogError: the file is missing or damaged, a topic is missing or ambiguous, or nothing can be paired.
@@ -80,13 +82,12 @@ class BagLog(StampedLog):
         path: str | Path,
         *,
         camera: str | Path | Calibration | None = None,
-        topics: dict[str, str] | None = None,
+        options: dict[str, str] | None = None,
         joint_delay: float = 0.0,
-        pair_within: float = MAX_STAMP_DIFFERENCE_S,
     ) -> None:
-        self.path, self._joint_delay, self._pair_within = Path(path), joint_delay, pair_within
-        self._given = dict(topics or {})
-        self.uri = str(path) + ("?" + "&".join(f"{k}={v}" for k, v in self._given.items()) if self._given else "")
+        self.path, self._joint_delay, self._given = Path(path), joint_delay, dict(options or {})
+        self._pair_within = seconds_of_option(self.path, self._given, MAX_STAMP_DIFFERENCE_S)
+        self.uri = join_address(self.path, self._given)
         self.name = self.path.stem
         self._reader = self._open()
         self._color, self._depth = self._image_topics()
@@ -257,7 +258,7 @@ class BagLog(StampedLog):
                 f"no stamp of {self._depth} is within {self._pair_within:g} s of one of {self._color}.",
                 file=self.path,
                 field="stamps",
-                hint="record both with the same clock",
+                hint=f"record both with the same clock, or pair more loosely: ?{PAIR_WITHIN}=0.05",
             )
         return pairs
 
@@ -294,17 +295,3 @@ class BagLog(StampedLog):
     def _damaged(self, error: Exception) -> LogError:
         hint = "copy the recording again, or repair it (`mcap recover`, `rosbag reindex`)"
         return LogError(f"cannot be read ({type(error).__name__}: {error}).", file=self.path, field="log", hint=hint)
-
-
-def split_query(uri: str) -> tuple[Path, dict[str, str]]:
-    """Split `FILE?color=TOPIC&depth=TOPIC` into the path and the topics.
-
-    Raises:
-        LogError: a key is unknown.
-    """
-    path, _, query = uri.partition("?")
-    given: dict[str, Any] = dict(pair.partition("=")[::2] for pair in query.split("&") if pair)
-    for key in given:
-        if key not in KEYS:
-            raise LogError(f"has no option {key!r}.", file=path, field="log", hint=f"the options are {', '.join(KEYS)}")
-    return Path(path), given

@@ -155,20 +155,6 @@ class LeRobotLog(FolderLog, StampedLog):
         return VideoFrames(path, start + self._rows["timestamp"], 0.25 / self.info.fps, size, codes)
 
 
-def split_query(uri: str) -> tuple[Path, dict[str, str]]:
-    """Split `DATASET?episode=N&color=KEY&depth=KEY` into the folder and the options.
-
-    Raises:
-        LogError: an option is unknown.
-    """
-    path, _, query = uri.partition("?")
-    given = {key: value for key, _, value in (pair.partition("=") for pair in query.split("&") if pair)}
-    for key in given.keys() - set(OPTIONS):
-        hint = f"the options are {', '.join(OPTIONS)}"
-        raise LogError(f"has no option {key!r:.40}.", file=path, field="log", hint=hint)
-    return Path(path), given
-
-
 def _number(uri: str, text: str) -> int:
     if not (text.isascii() and text.isdigit() and len(text) < 10):
         raise LogError(f"is {text!r:.40}.", file=uri, field="episode", hint="give a number: DATASET?episode=3")

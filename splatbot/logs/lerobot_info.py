@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -20,8 +20,10 @@ INFO = "meta/info.json"
 EPISODES = "meta/episodes"
 UNITS = {"m": 1.0, "mm": 1000.0}  # per metre, by `depth_unit`
 _MAX_INFO = 2**24  # bytes
+_MAX_EPISODES = 2**20
 _MAX_FRAMES = 2**20  # of an episode
 _MAX_DEPTH = 1e4  # [m] of codes
+_INDICES = ("chunk_index", "file_index")  # of a file
 _HOLE = re.compile(r"\{(\w+)(?::0([1-9])d)?\}", re.ASCII)  # of a template of paths; str.format would obey any format
 _DEPTH_KEYS = (("info", "is_depth_map"), ("info", "video.is_depth_map"), ("video_info", "video.is_depth_map"))
 _AGAIN = "copy or download the dataset again"
@@ -167,45 +169,52 @@ def read_episode(info: DatasetInfo, number: int, videos: Iterable[str]) -> Episo
     Raises:
         LogError: there is no such episode, a table is damaged, or the episode shares frames with another one.
     """
-    keys = list(videos)
-    integers = ["episode_index", "length", "dataset_from_index", "dataset_to_index"]
-    integers += [f"{part}/{name}" for part in ("data", *_parts(keys)) for name in ("chunk_index", "file_index")]
-    numbers = [f"{part}/{name}" for part in _parts(keys) for name in ("from_timestamp", "to_timestamp")]
-    files = sorted((info.folder / EPISODES).glob("*/*.parquet"))
-    place = info.folder / EPISODES
-    if not files:
-        raise LogError("holds no episodes.", file=place, field="files", hint=_AGAIN)
-    tables = [read_columns(file, integers=integers, numbers=numbers) for file in files]
-    table = {name: np.concatenate([t[name] for t in tables]) for name in (*integers, *numbers)}
-    rows = np.flatnonzero(table["episode_index"] == number)
-    if len(rows) != 1:
-        held = np.unique(table["episode_index"]).tolist()
-        problem = f"has {len(rows)} rows of episode {number}."
-        hint = f"its {len(held)} episodes are {', '.join(map(str, held[:8]))}{', ...' if len(held) > 8 else ''}"
-        raise LogError(problem, file=place, field="episode_index", hint=hint)
-    row = {name: column[rows[0]].item() for name, column in table.items()}
+    keys, place = list(videos), info.folder / EPISODES
+    table = _episode_table(place, keys)
+    own = _own_row(place, table["episode_index"], number)
+    row = {name: column[own].item() for name, column in table.items()}
     if not 0 < row["length"] == row["dataset_to_index"] - row["dataset_from_index"] <= _MAX_FRAMES:
         problem = f"is {row['length']} for frames {row['dataset_from_index']} to {row['dataset_to_index']}."
         raise LogError(problem, file=place, field=f"length of episode {number}", hint=_AGAIN)
-    _check_alone(place, "dataset_from_index", table["dataset_from_index"], table["dataset_to_index"], rows[0], 0.0)
-    for part in _parts(keys):
-        same = [table[f"{part}/{name}"] == row[f"{part}/{name}"] for name in ("chunk_index", "file_index")]
-        shared = np.flatnonzero(same[0] & same[1])
+    _check_alone(place, "dataset_from_index", table["dataset_from_index"], table["dataset_to_index"], own, 0.0)
+    found: dict[str, tuple[Path, float]] = {}
+    for key in keys:
+        part = f"videos/{key}"
+        same = [table[f"{part}/{name}"] == row[f"{part}/{name}"] for name in _INDICES]
+        shared = np.flatnonzero(same[0] & same[1])  # episodes in the same file
         spans = [table[f"{part}/{name}"][shared] for name in ("from_timestamp", "to_timestamp")]
-        own = int(np.searchsorted(shared, rows[0]))
-        _check_alone(place, f"{part}/from_timestamp", spans[0], spans[1], own, 0.5 / info.fps)
-    return Episode(
-        length=row["length"],
-        first=row["dataset_from_index"],
-        data=info.path("data_path", **_indices(row, "data")),
-        videos={
-            key: (
-                info.path("video_path", video_key=key, **_indices(row, f"videos/{key}")),
-                row[f"videos/{key}/from_timestamp"],
-            )
-            for key in keys
-        },
-    )
+        at = int(np.searchsorted(shared, own))
+        _check_alone(place, f"{part}/from_timestamp", spans[0], spans[1], at, 0.5 / info.fps)
+        path = info.path("video_path", video_key=key, **{name: row[f"{part}/{name}"] for name in _INDICES})
+        found[key] = path, row[f"{part}/from_timestamp"]
+    data = info.path("data_path", **{name: row[f"data/{name}"] for name in _INDICES})
+    return Episode(row["length"], row["dataset_from_index"], data, found)
+
+
+def _episode_table(place: Path, keys: Sequence[str]) -> dict[str, NDArray[Any]]:
+    """Return the columns of all episodes that place the data, and the videos of ``keys``."""
+    videos = [f"videos/{key}" for key in keys]
+    integers = ["episode_index", "length", "dataset_from_index", "dataset_to_index"]
+    integers += [f"{part}/{name}" for part in ("data", *videos) for name in _INDICES]
+    numbers = [f"{part}/{name}" for part in videos for name in ("from_timestamp", "to_timestamp")]
+    tables: list[dict[str, NDArray[Any]]] = []
+    for file in sorted(place.glob("*/*.parquet")):
+        tables.append(read_columns(file, integers=integers, numbers=numbers))
+        if sum(len(table["length"]) for table in tables) > _MAX_EPISODES:
+            raise LogError(f"holds over {_MAX_EPISODES} episodes.", file=place, field="files", hint=_AGAIN)
+    if not tables:
+        raise LogError("holds no episodes.", file=place, field="files", hint=_AGAIN)
+    return {name: np.concatenate([table[name] for table in tables]) for name in (*integers, *numbers)}
+
+
+def _own_row(place: Path, episodes: NDArray[np.int64], number: int) -> int:
+    rows = np.flatnonzero(episodes == number)
+    if len(rows) == 1:
+        return int(rows[0])
+    held = np.unique(episodes).tolist()
+    problem = f"has {len(rows)} rows of episode {number}."
+    hint = f"its {len(held)} episodes are {', '.join(map(str, held[:8]))}{', ...' if len(held) > 8 else ''}"
+    raise LogError(problem, file=place, field="episode_index", hint=hint)
 
 
 def _check_alone(file: Path, field: str, starts: NDArray[Any], ends: NDArray[Any], own: int, tolerance: float) -> None:
@@ -217,14 +226,6 @@ def _check_alone(file: Path, field: str, starts: NDArray[Any], ends: NDArray[Any
     if shared.sum() > 1:
         problem = f"{start:g} to {end:g} is shared by {shared.sum()} episodes."
         raise LogError(problem, file=file, field=field, hint=_AGAIN)
-
-
-def _parts(keys: Iterable[str]) -> list[str]:
-    return [f"videos/{key}" for key in keys]
-
-
-def _indices(row: dict[str, Any], part: str) -> dict[str, int]:
-    return {name: row[f"{part}/{name}"] for name in ("chunk_index", "file_index")}
 
 
 def _details(feature: dict[str, Any]) -> dict[str, Any]:

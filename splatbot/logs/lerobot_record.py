@@ -104,6 +104,7 @@ class _Rows:
         self._names, self._joints = first.joint_names, 0 if first.joints is None else len(first.joints)
         self.features = _features(first.camera, self._names, self._joints, truth is not None)
         self.moments = {key: _Moments() for key in self.features if key not in (STAMP, POSE)}
+        self.moments[COLOR] = _Moments(255.0)
         self.count = self.jointless = self.masked = self.delayed = 0
 
     def row(self, frame: Frame) -> dict[str, Any]:
@@ -123,10 +124,10 @@ class _Rows:
             self.jointless += 1
         if self._truth is not None:
             row[POSE] = _pose_at(self._truth, frame.stamp)
-        self.moments[COLOR].add(frame.rgb.reshape(-1, 3) / 255.0)
-        self.moments[DEPTH].add(frame.depth.reshape(-1, 1))
+        self.moments[COLOR].add(np.moveaxis(frame.rgb, -1, 0).reshape(3, -1))
+        self.moments[DEPTH].add(frame.depth.reshape(1, -1))
         for key in self.moments.keys() - {COLOR, DEPTH}:
-            self.moments[key].add(np.asarray(row[key], np.float64).reshape(1, -1))
+            self.moments[key].add(np.asarray(row[key], np.float64).reshape(-1, 1))
         self.count += 1
         self.masked += frame.mask is not None
         self.delayed += frame.depth_delay != 0
@@ -145,9 +146,14 @@ class _Rows:
 
 
 class _Moments:
-    """Statistics of values (N, K) of all frames."""
+    """Statistics of values (K, N) of all frames, divided by a scale.
 
-    def __init__(self) -> None:
+    Args:
+        scale: value that counts as 1.
+    """
+
+    def __init__(self, scale: float = 1.0) -> None:
+        self._scale = scale
         self._frames, self._values = 0, 0
         self._low: Any = np.inf
         self._high: Any = -np.inf
@@ -155,13 +161,14 @@ class _Moments:
         self._squares: Any = 0.0
 
     def add(self, values: NDArray[Any]) -> None:
-        """Add the values (N, K) of a frame; values that are not finite are left out."""
+        """Add the values (K, N) of a frame, which are left out if one is not finite."""
         if not np.isfinite(values).all():
             return
-        self._frames, self._values = self._frames + 1, self._values + len(values)
-        self._low, self._high = np.minimum(self._low, values.min(0)), np.maximum(self._high, values.max(0))
-        self._sum = self._sum + values.sum(0, dtype=np.float64)
-        self._squares = self._squares + np.square(values, dtype=np.float64).sum(0)
+        self._frames, self._values = self._frames + 1, self._values + values.shape[1]
+        self._low, self._high = np.minimum(self._low, values.min(1)), np.maximum(self._high, values.max(1))
+        exact = values.astype(np.float64)
+        self._sum = self._sum + exact.sum(1)
+        self._squares = self._squares + np.einsum("kn,kn->k", exact, exact)
 
     def result(self, shape: Sequence[int]) -> dict[str, Any]:
         """Return the statistics as lists; those of channels of images are (K, 1, 1)."""
@@ -169,9 +176,8 @@ class _Moments:
         deviation = np.sqrt(np.maximum(self._squares / self._values - mean**2, 0))
         found = {"min": self._low, "max": self._high, "mean": mean, "std": deviation}
         as_image = (-1, 1, 1) if len(shape) == 3 else (-1,)
-        return {name: np.asarray(v, np.float64).reshape(as_image).tolist() for name, v in found.items()} | {
-            "count": [self._frames]
-        }
+        lists = {name: (np.asarray(value) / self._scale).reshape(as_image).tolist() for name, value in found.items()}
+        return lists | {"count": [self._frames]}
 
 
 def _features(camera: Camera, names: Sequence[str], joints: int, has_poses: bool) -> dict[str, dict[str, Any]]:

@@ -13,6 +13,7 @@ import numpy as np
 from splatbot.camera import Camera
 from splatbot.errors import LogError
 from splatbot.frame import Frame
+from splatbot.logs.address import PAIR_WITHIN
 from splatbot.logs.bag import BagLog
 from splatbot.logs.base import Log, LogBase
 from splatbot.logs.mcap import McapFile, write_frame
@@ -113,7 +114,7 @@ class RecordedCamera(LogBase):
         self._thread.join()
         if self._recording is None:
             self._file.close()
-            self._recording = BagLog(self.uri, pair_within=np.inf)
+            self._recording = BagLog(self.uri, options={PAIR_WITHIN: "10"})
 
     def _record(self) -> None:
         begun, last = time.monotonic(), -np.inf

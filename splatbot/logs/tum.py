@@ -12,6 +12,7 @@ import numpy as np
 
 from splatbot.errors import CameraError, LogError
 from splatbot.frame import Frame
+from splatbot.logs.address import PAIR_WITHIN, join_address, seconds_of_option
 from splatbot.logs.base import StampedLog
 from splatbot.logs.calibration import Calibration, read_calibration
 from splatbot.logs.effects import read_account
@@ -51,6 +52,7 @@ class TumLog(FolderLog, StampedLog):
         camera: intrinsics that replace the log's own.
         missing: see above.
         joint_delay: time [s] by which the stamps of joint positions are later than their motion.
+        options: `pair_within` is the largest difference [s] of the stamps of a pair.
 
     Raises:
         LogError: a list is missing, empty or malformed, nothing can be associated, or `effects.json` is damaged.
@@ -64,8 +66,11 @@ class TumLog(FolderLog, StampedLog):
         camera: str | Path | Calibration | None = None,
         missing: Missing = "auto",
         joint_delay: float = 0.0,
+        options: dict[str, str] | None = None,
     ) -> None:
         super().__init__(folder)
+        self._pair_within = seconds_of_option(self.folder, options or {}, MAX_STAMP_DIFFERENCE_S)
+        self.uri = join_address(self.folder, options or {})
         colors, self._depths = read_index(self.folder / "rgb.txt"), read_index(self.folder / "depth.txt")
         pairs = self._pair(colors)
         self.unpaired = len(colors) - len(pairs)
@@ -109,21 +114,21 @@ class TumLog(FolderLog, StampedLog):
 
     def _pair(self, colors: list[IndexEntry]) -> dict[int, IndexEntry]:
         a, b = (np.array([entry.stamp for entry in entries]) for entries in (colors, self._depths))
-        pairs = {i: self._depths[j] for i, j in associate(a, b, MAX_STAMP_DIFFERENCE_S)}
+        pairs = {i: self._depths[j] for i, j in associate(a, b, self._pair_within)}
         if not pairs:
             raise LogError(
-                f"no stamp is within {MAX_STAMP_DIFFERENCE_S} s of one in rgb.txt (colour {a[0]:.3f}..{a[-1]:.3f} s, "
+                f"no stamp is within {self._pair_within:g} s of one in rgb.txt (colour {a[0]:.3f}..{a[-1]:.3f} s, "
                 f"depth {b[0]:.3f}..{b[-1]:.3f} s).",
                 file=self.folder / "depth.txt",
                 field="stamps",
-                hint="write both lists in seconds of the same clock",
+                hint=f"write both lists in seconds of the same clock, or pair more loosely: ?{PAIR_WITHIN}=0.05",
             )
         return pairs
 
     def _no_partner(self, color: IndexEntry) -> LogError:
         before = [entry.line for entry in self._depths if entry.stamp < color.stamp]
         return LogError(
-            f"no depth image within {MAX_STAMP_DIFFERENCE_S} s of stamp {color.stamp:.6f} "
+            f"no depth image within {self._pair_within:g} s of stamp {color.stamp:.6f} "
             f"({color.path}, line {color.line} of rgb.txt).",
             file=self.folder / "depth.txt",
             field=f"after line {before[-1]}" if before else "first line",
