@@ -9,13 +9,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 
 from splatbot.errors import InputError, LogError
 from splatbot.frame import Frame
 from splatbot.logs import open_log
+from tests.unit.logs.published import Pose, encoded
+
+pytest.importorskip("av", reason="av (extra lerobot) is not installed")
+pytest.importorskip("pyarrow", reason="pyarrow (extra lerobot) is not installed")
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
 from tests.unit.logs.lerobot_dataset import (
     DATA,
     EPISODES,
@@ -26,7 +32,6 @@ from tests.unit.logs.lerobot_dataset import (
     tiff,
     write_lerobot,
 )
-from tests.unit.logs.published import Pose, encoded
 
 Scene = tuple[list[Frame], list[Pose]]
 DEPTH = f"{WRIST}_depth"

@@ -7,13 +7,19 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import av
 import numpy as np
 import pytest
 
 from splatbot.errors import LogError
 from splatbot.frame import Frame
 from splatbot.logs import Log, open_log
+from tests.unit.logs.published import Pose
+
+pytest.importorskip("av", reason="av (extra lerobot) is not installed")
+pytest.importorskip("pyarrow", reason="pyarrow (extra lerobot) is not installed")
+
+import av
+
 from tests.unit.logs.lerobot_dataset import (
     EPISODES,
     WRIST,
@@ -25,7 +31,6 @@ from tests.unit.logs.lerobot_dataset import (
     write_lerobot,
     write_video,
 )
-from tests.unit.logs.published import Pose
 from tests.unit.logs.test_bad_lerobot import only_frame_is_bad, refused
 
 Scene = tuple[list[Frame], list[Pose]]

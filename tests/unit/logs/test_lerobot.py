@@ -15,6 +15,11 @@ from splatbot.errors import CameraError, LogError
 from splatbot.frame import Frame
 from splatbot.geometry import rotation_to_quat
 from splatbot.logs import open_log
+from tests.unit.logs.published import Pose
+
+pytest.importorskip("av", reason="av (extra lerobot) is not installed")
+pytest.importorskip("pyarrow", reason="pyarrow (extra lerobot) is not installed")
+
 from tests.unit.logs.lerobot_dataset import (
     DATA,
     FPS,
@@ -26,7 +31,6 @@ from tests.unit.logs.lerobot_dataset import (
     write_lerobot,
     write_video,
 )
-from tests.unit.logs.published import Pose
 
 Scene = tuple[list[Frame], list[Pose]]
 STATE = {"dtype": "float32", "shape": [2], "names": ["shoulder.pos", "elbow.pos"]}

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 
 from splatbot.camera import Camera
@@ -20,9 +19,15 @@ from splatbot.errors import LogError
 from splatbot.frame import Frame
 from splatbot.logs import open_log
 from splatbot.logs.base import LogBase
-from splatbot.logs.lerobot_record import record_lerobot
 from splatbot.trajectory import Trajectory
 from tests.unit.logs.published import Pose
+
+pytest.importorskip("av", reason="av (extra lerobot) is not installed")
+pytest.importorskip("pyarrow", reason="pyarrow (extra lerobot) is not installed")
+
+import pyarrow.parquet as pq
+
+from splatbot.logs.lerobot_record import record_lerobot
 
 Scene = tuple[list[Frame], list[Pose]]
 LEROBOT = os.environ.get("LEROBOT_PYTHON", "")  # an interpreter that has the package lerobot 0.6

@@ -12,7 +12,6 @@ import pytest
 from splatbot.cli import main
 from splatbot.frame import Frame
 from splatbot.trajectory import Trajectory
-from tests.unit.logs.lerobot_dataset import WRIST, write_lerobot
 from tests.unit.logs.published import (
     Pose,
     encoded,
@@ -51,12 +50,20 @@ def seven_scenes(folder: Path, frames: list[Frame], poses: list[Pose]) -> Path:
 
 def lerobot_images(folder: Path, frames: list[Frame], _poses: list[Pose]) -> Path:
     """Write a LeRobot dataset of images."""
-    return write_lerobot(folder, {WRIST: [frames]})
+    return lerobot(folder, frames)
 
 
 def lerobot_videos(folder: Path, frames: list[Frame], _poses: list[Pose]) -> Path:
     """Write a LeRobot dataset of videos, which round depth and colour."""
-    return write_lerobot(folder, {WRIST: [frames]}, video=True)
+    return lerobot(folder, frames, video=True)
+
+
+def lerobot(folder: Path, frames: list[Frame], *, video: bool = False) -> Path:
+    for package in ("av", "pyarrow"):
+        pytest.importorskip(package, reason=f"{package} (extra lerobot) is not installed")
+    from tests.unit.logs.lerobot_dataset import WRIST, write_lerobot
+
+    return write_lerobot(folder, {WRIST: [frames]}, video=video)
 
 
 def mapped(log: Path, out: Path) -> Trajectory:
