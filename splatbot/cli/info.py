@@ -61,7 +61,7 @@ def info(
 
     Args:
         path: a map file, a run folder (its map), synthetic:SCENE, or a recording. Folders are of TUM, Replica,
-            7-Scenes, Open3D, ScanNet, Nerfstudio or rosbag2; files are .mcap, .bag, .sens or .r3d.
+            7-Scenes, Open3D, ScanNet, Nerfstudio, LeRobot or rosbag2; files are .mcap, .bag, .sens or .r3d.
         camera: intrinsics of the log: tum_fr1, tum_fr2, tum_fr3 or an intrinsics.json.
         fit_plane: estimate the plane of the table or floor and propose a base of a robot. They are written to
             scene.yaml next to the map, with the picture scene.png. A doubtful estimate is not written.

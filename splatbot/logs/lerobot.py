@@ -11,23 +11,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from splatbot.errors import CameraError, LogError
+from splatbot.errors import LogError
 from splatbot.frame import Frame
 from splatbot.geometry import pose_from_quat
 from splatbot.logs.base import MILLIMETRES, StampedLog
-from splatbot.logs.calibration import Calibration, read_calibration
+from splatbot.logs.calibration import Calibration
 from splatbot.logs.joints import JointStates
+from splatbot.logs.lerobot_camera import find_cameras
 from splatbot.logs.lerobot_images import EmbeddedImages
 from splatbot.logs.lerobot_info import read_episode, read_info
 from splatbot.logs.lerobot_tables import read_columns
 from splatbot.logs.lerobot_video import VideoFrames
 from splatbot.logs.poses import reference, rigid_pose
-from splatbot.logs.presets import find_calibration
 from splatbot.logs.rgbd import FolderLog, RgbdReader
 from splatbot.trajectory import Trajectory
 
 OPTIONS = ("episode", "color", "depth")
-INTRINSICS = "intrinsics.json"
 STATE, POSE, STAMP = "observation.state", "splatbot.camera_pose", "splatbot.stamp"
 POSE_NAMES = ["x", "y", "z", "qw", "qx", "qy", "qz"]
 _POSITION = ".pos"  # that LeRobot appends to the names of joints
@@ -35,7 +34,7 @@ _AGAIN = "copy or download the dataset again"
 
 
 class LeRobotLog(FolderLog, StampedLog):
-    """An episode of a dataset; colour and depth are images or videos.
+    """An episode of a dataset; colour and depth are images or videos, with one camera or registered to depth.
 
     Joints are the column `observation.state`. Two columns of splatbot are optional: `splatbot.stamp` holds stamps [s]
     that replace `timestamp`, and `splatbot.camera_pose` reference poses T_world_camera.
@@ -43,7 +42,7 @@ class LeRobotLog(FolderLog, StampedLog):
     Args:
         folder: of the dataset.
         options: keys of colour and depth, by `color` and `depth`, and the number `episode`, by default 0.
-        camera: intrinsics that replace `intrinsics.json` of the folder.
+        camera: camera of both images; see :func:`splatbot.logs.lerobot_camera.find_cameras`.
         joint_delay: time [s] by which the stamps of joint positions are later than their motion.
 
     Raises:
@@ -74,9 +73,12 @@ class LeRobotLog(FolderLog, StampedLog):
         self.stamps = self._stamps()
         units = self.info.depth_units(self._depth_key)
         is_fine = self._depth_key in videos or units == 1
-        calibration = replace(self._calibration(camera), depth_scale=1.0 if is_fine else MILLIMETRES)
-        self._reader = RgbdReader(calibration)
-        self._color, self._depth = (self._images(key, units) for key in keys)
+        found, self._registration = find_cameras(self.folder, camera)
+        self._reader = RgbdReader(replace(found, depth_scale=1.0 if is_fine else MILLIMETRES))
+        size = (found.camera.width, found.camera.height)
+        color_size = size if self._registration is None else self._registration.color_size
+        self._color = self._images(self._color_key, color_size)
+        self._depth = self._images(self._depth_key, size, units)
 
     @cached_property
     def ground_truth(self) -> Trajectory | None:
@@ -98,6 +100,8 @@ class LeRobotLog(FolderLog, StampedLog):
             for key in (self._color_key, self._depth_key)
         )
         rgb, z = self._color.color(index, color), self._depth.depth(index, depth)
+        if self._registration is not None:
+            rgb, z = self._registration.register(rgb, z, color)
         try:
             frame = self._reader.frame(index, self.stamps[index], rgb, z, color, depth)
         except LogError as error:
@@ -136,18 +140,7 @@ class LeRobotLog(FolderLog, StampedLog):
                 raise LogError("is not increasing.", file=self._place.data, field=name, hint=hint)
         return [float(stamp) for stamp in stamps]
 
-    def _calibration(self, camera: str | Path | Calibration | None) -> Calibration:
-        if camera is not None:
-            return find_calibration(camera)
-        path = self.folder / INTRINSICS
-        if path.exists():
-            return read_calibration(path)
-        hint = "write it with fx, fy, cx, cy, width, height [px] and depth_scale, or give --camera FILE"
-        raise CameraError("the dataset has no intrinsics.", file=path, field="camera", hint=hint)
-
-    def _images(self, key: str, units: float | None) -> EmbeddedImages | VideoFrames:
-        camera = self.calibration.camera
-        size = (camera.width, camera.height)
+    def _images(self, key: str, size: tuple[int, int], units: float | None = None) -> EmbeddedImages | VideoFrames:
         if key not in self._place.videos:
             return EmbeddedImages(self._place.data, key, self._rows["row"], size, units)
         path, start = self._place.videos[key]

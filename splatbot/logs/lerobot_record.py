@@ -22,7 +22,8 @@ from splatbot.geometry import inverse, rotation_to_quat, se3_exp, se3_log
 from splatbot.logs.base import MILLIMETRES, Log
 from splatbot.logs.calibration import Calibration, save_calibration
 from splatbot.logs.joints import MAX_GAP
-from splatbot.logs.lerobot import INTRINSICS, POSE, POSE_NAMES, STAMP, STATE
+from splatbot.logs.lerobot import POSE, POSE_NAMES, STAMP, STATE
+from splatbot.logs.lerobot_camera import INTRINSICS
 from splatbot.logs.lerobot_info import EPISODES, INFO
 from splatbot.logs.record import Progress
 from splatbot.trajectory import Trajectory

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -186,6 +188,30 @@ def test_a_dataset_without_intrinsics_takes_those_of_the_user(tmp_path: Path, sc
     with pytest.raises(CameraError, match=r"the dataset has no intrinsics\. Fix: .*--camera FILE"):
         open_log(folder)
     assert open_log(folder, camera=tmp_path / "camera.json").camera == scene[0][0].camera
+
+
+def test_depth_of_another_camera_takes_its_colour_from_where_it_is_seen(tmp_path: Path, scene: Scene) -> None:
+    frame = scene[0][0]
+    wall = replace(frame, depth=np.full_like(frame.depth, 2.0))
+    folder = write_lerobot(tmp_path, {WRIST: [[wall] * 2]})
+    c = frame.camera
+    values = json.loads((folder / "intrinsics.json").read_text())
+    T = np.eye(4)
+    T[0, 3] = 5 * 2.0 / c.fx  # 5 px at 2 m
+    (folder / "depth_intrinsics.json").write_text(json.dumps(values | {"T_color_depth": T.tolist()}))
+    read = open_log(folder)[1]
+    np.testing.assert_array_equal(read.rgb[:, :150], frame.rgb[:, 5:155])
+    assert (read.depth[:, :154] == 2).all()
+    assert (read.depth[:, 155:] == 0).all()  # outside of the colour image
+    assert open_log(folder, camera=folder / "intrinsics.json")[1].depth.all()
+    for bad in (None, [1, 2], (2 * T).tolist(), "x", [[10**400] * 4] * 4):
+        (folder / "depth_intrinsics.json").write_text(json.dumps(values | {"T_color_depth": bad}))
+        with pytest.raises(CameraError, match=r"depth_intrinsics\.json: T_color_depth: is no rigid transform\. Fix: "):
+            open_log(folder)
+    distorted = values | {"T_color_depth": T.tolist(), "distortion": [0.1, 0, 0, 0]}
+    (folder / "depth_intrinsics.json").write_text(json.dumps(distorted))
+    with pytest.raises(CameraError, match="distortion: cannot be registered"):
+        open_log(folder)
 
 
 def test_a_dataset_without_depth_is_named(tmp_path: Path, scene: Scene) -> None:
