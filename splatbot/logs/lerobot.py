@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from splatbot.errors import LogError
 from splatbot.frame import Frame
 from splatbot.geometry import pose_from_quat
+from splatbot.logs.address import join_address
 from splatbot.logs.base import MILLIMETRES, StampedLog
 from splatbot.logs.calibration import Calibration
 from splatbot.logs.joints import JointStates
@@ -60,7 +61,7 @@ class LeRobotLog(FolderLog, StampedLog):
     ) -> None:
         super().__init__(folder)
         given = options or {}
-        self.uri += "?" * bool(given) + "&".join(f"{key}={value}" for key, value in given.items())
+        self.uri = join_address(self.folder, given)
         self._joint_delay = joint_delay
         self.info = read_info(self.folder)
         self.episode = _number(self.uri, given.get("episode", "0"))
