@@ -31,6 +31,7 @@ OPTIONS = ("episode", "color", "depth")
 STATE, POSE, STAMP = "observation.state", "splatbot.camera_pose", "splatbot.stamp"
 POSE_NAMES = ["x", "y", "z", "qw", "qx", "qy", "qz"]
 _POSITION = ".pos"  # that LeRobot appends to the names of joints
+_MAX_STAMP = 1e12  # [s]
 _AGAIN = "copy or download the dataset again"
 
 
@@ -136,7 +137,7 @@ class LeRobotLog(FolderLog, StampedLog):
     def _stamps(self) -> list[float]:
         for name in ("timestamp", *([STAMP] if STAMP in self._rows else [])):
             stamps = self._rows[name]
-            if not np.isfinite(stamps).all() or not (np.diff(stamps) > 0).all():
+            if not (np.abs(stamps) < _MAX_STAMP).all() or not (np.diff(stamps) > 0).all():
                 hint = "write the times of the frames [s], in their order"
                 raise LogError("is not increasing.", file=self._place.data, field=name, hint=hint)
         return [float(stamp) for stamp in stamps]

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from splatbot.errors import LogError
 
-_MAX_VALUES = 2**26  # that are read of one file
+_MAX_BYTES = 2**29  # of the numbers that are read of one file
+_ROWS = 4096  # that are read at once
 _BUFFER = 2**20  # [bytes] of a file that is read in pieces
 DAMAGED = (pa.ArrowException, OSError, ValueError, KeyError, NotImplementedError)
 _AGAIN = "copy or download the dataset again"
@@ -28,15 +29,14 @@ def read_columns(
     Raises:
         LogError: the file is missing or damaged, a column is missing or of another type, or there are too many values.
     """
-    file = open_parquet(path)
     wanted = (*integers, *numbers, *vectors)
-    for names, fits in ((integers, pa.types.is_integer), (numbers, _is_number), (vectors, _is_vector)):
-        for name in names:
-            kind = column_type(file, path, name)
-            check_type(path, name, kind, fits(kind))
-    _check_size(file, path, wanted)
+    file = open_parquet(path)
     try:
-        table = file.read(columns=list(wanted))
+        for names, fits in ((integers, pa.types.is_integer), (numbers, _is_number), (vectors, _is_vector)):
+            for name in names:
+                kind = column_type(file, path, name)
+                check_type(path, name, kind, fits(kind))
+        table = pa.Table.from_batches(_batches(file, path, wanted))
         columns = {name: table.column(name).combine_chunks() for name in wanted}
     except DAMAGED as error:
         raise damaged(path, error) from error
@@ -46,6 +46,24 @@ def read_columns(
     found: dict[str, NDArray[Any]] = {name: np.asarray(columns[name], np.int64) for name in integers}
     found |= {name: np.asarray(columns[name], np.float64) for name in numbers}
     return found | {name: _vectors(path, name, columns[name]) for name in vectors}
+
+
+def _batches(file: pq.ParquetFile, path: Path, names: Sequence[str]) -> list[pa.RecordBatch]:
+    """Read columns while they are small: a few bytes of a file can hold millions of equal values.
+
+    Sizes that the file announces for its columns are not used: pyarrow ends the process if they are damaged.
+    """
+    found: list[pa.RecordBatch] = []
+    size = 0
+    for batch in file.iter_batches(_ROWS, columns=list(names)):
+        found.append(batch)
+        size += batch.nbytes
+        if size > _MAX_BYTES:
+            problem = f"has over {_MAX_BYTES} bytes of numbers."
+            raise LogError(problem, file=path, field="rows", hint="split the dataset into smaller files")
+    if not found:
+        raise LogError("has no rows.", file=path, field="rows", hint=_AGAIN)
+    return found
 
 
 def open_parquet(path: Path) -> pq.ParquetFile:
@@ -89,20 +107,6 @@ def check_type(path: Path, name: str, kind: pa.DataType, fits: bool) -> None:
     """
     if not fits:
         raise LogError(f"is of type {kind}.", file=path, field=name, hint=_AGAIN)
-
-
-def _check_size(file: pq.ParquetFile, path: Path, names: Sequence[str]) -> None:
-    """Check the number of values before they are read: a few bytes can announce millions of equal values."""
-    metadata = file.metadata
-    roots = tuple(f"{name}." for name in names)
-    count = 0
-    for number in range(metadata.num_row_groups):
-        group = metadata.row_group(number)
-        columns = (group.column(index) for index in range(group.num_columns))
-        count += sum(c.num_values for c in columns if f"{c.path_in_schema}.".startswith(roots))
-    if count > _MAX_VALUES or metadata.num_rows > _MAX_VALUES:
-        problem = f"has {max(count, metadata.num_rows)} values, more than {_MAX_VALUES}."
-        raise LogError(problem, file=path, field="rows", hint="split the dataset into smaller files")
 
 
 def _vectors(path: Path, name: str, column: Any) -> NDArray[np.float64]:

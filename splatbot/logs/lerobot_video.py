@@ -75,11 +75,13 @@ class VideoFrames:
         self._path, self._times, self._tolerance, self._codes = path, times, tolerance, codes
         try:
             # The format is given, since files of other formats may name further files to open.
-            self._container = av.open(str(path.absolute()), format="mp4")
+            self._container = av.open(str(path.absolute()), format="mp4", metadata_errors="replace")
             self._stream = self._container.streams.video[0]
         except (av.FFmpegError, OSError, IndexError) as error:
             problem = "does not exist." if not path.exists() else f"is no whole MP4 video ({error})."
             raise LogError(problem, file=path, field="video", hint=_AGAIN) from error
+        if self._stream.codec_context is None:
+            raise LogError("has an unknown codec.", file=path, field="video", hint=_AGAIN)
         found, self._size = (self._stream.width, self._stream.height), size
         if found != size:
             problem = f"is {found[0]}x{found[1]}; the intrinsics are for {size[0]}x{size[1]}."
@@ -116,7 +118,7 @@ class VideoFrames:
         except StopIteration as error:
             self._current = None
             raise LogError("is beyond the end of the video.", file=source, field=field, hint=_AGAIN) from error
-        except (av.FFmpegError, ValueError) as error:
+        except (av.FFmpegError, ValueError, OverflowError) as error:
             self._current = None
             raise LogError(f"is damaged ({error}).", file=source, field=field, hint=_AGAIN) from error
         if found > time + self._tolerance:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import struct
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ pytest.importorskip("pyarrow", reason="pyarrow (extra lerobot) is not installed"
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from splatbot.logs.lerobot_tables import read_columns
 from tests.unit.logs.lerobot_dataset import (
     DATA,
     EPISODES,
@@ -146,6 +148,7 @@ def test_missing_chunks_are_named(images: Path) -> None:
         ("timestamp", lambda v: [0.0, float("nan"), 0.1] * 2, "not increasing"),
         ("timestamp", lambda v: [0.0, 0.2, 0.1] * 2, "not increasing"),
         ("timestamp", lambda v: [0.0, 0.0, 0.1] * 2, "not increasing"),
+        ("timestamp", lambda v: [0.0, 0.1, 1e30] * 2, "not increasing"),
         ("timestamp", lambda v: ["0"] * 6, "is of type string"),
         ("timestamp", None, "no such column"),
         ("frame_index", lambda v: [0, 2, 1, 0, 1, 2], "does not count the 3 frames"),
@@ -172,9 +175,22 @@ def test_lengths_of_equal_episodes_may_be_huge(images: Path) -> None:
     refused(images, "meta/episodes", "length of episode 0")
 
 
-def test_tables_of_more_values_than_memory_are_not_read(images: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("splatbot.logs.lerobot_tables._MAX_VALUES", 20)
-    refused(images, DATA, "rows", "more than 20")
+def test_tables_of_more_values_than_memory_are_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pq.write_table(pa.table({"a": np.zeros(100_000)}), tmp_path / "a.parquet")
+    assert (tmp_path / "a.parquet").stat().st_size < 10_000
+    monkeypatch.setattr("splatbot.logs.lerobot_tables._MAX_BYTES", 2**16)
+    with pytest.raises(LogError, match=r"rows: has over 65536 bytes of numbers\. Fix: "):
+        read_columns(tmp_path / "a.parquet", numbers=["a"])
+
+
+def test_a_damaged_description_of_columns_does_not_end_the_process(images: Path) -> None:
+    data = (images / EPISODES).read_bytes()
+    for at in range(1, 1500, 3):  # the footer lies at the end
+        damaged = bytearray(data)
+        damaged[-at] ^= 0x15
+        (images / EPISODES).write_bytes(damaged)
+        with suppress(LogError):
+            open_log(images)
 
 
 @pytest.mark.parametrize("option", ["episode=x", "episode=-1", "episode=99999999999", "episodes=1", "episode=2"])
