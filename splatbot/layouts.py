@@ -8,7 +8,17 @@ from typing import Literal
 from splatbot.errors import FormatError, LogError
 
 LogKind = Literal[
-    "synthetic", "bag", "tum", "replica", "7scenes", "images", "transforms", "scannet", "record3d", "lerobot"
+    "synthetic",
+    "bag",
+    "tum",
+    "replica",
+    "7scenes",
+    "images",
+    "transforms",
+    "scannet",
+    "record3d",
+    "lerobot",
+    "realsense",
 ]
 
 MAP_NAME = "map.ply"
@@ -20,9 +30,10 @@ MAP_SUFFIXES = (".ply", ".splat", ".spz", ".sog", ".glb")
 _SOG_NAME = "meta.json"  # of a map in a folder of WebP images
 _LAYOUTS_HINT = (
     "known folders: rgb.txt with depth.txt (TUM), results/ with traj.txt (Replica), metadata.yaml (ROS 2), 7-Scenes, "
-    "color/ with depth/ (Open3D, ScanNet), meta/info.json (LeRobot). Known files: .mcap, .bag, .sens, .r3d; "
-    "`synthetic:tabletop` needs no files"
+    "color/ with depth/ (Open3D, ScanNet), meta/info.json (LeRobot). Known files: .mcap, .bag, .sens, .r3d, "
+    ".db3 (RealSense); `synthetic:tabletop` needs no files"
 )
+_REALSENSE = b"/device_0/sensor_"  # beginning of the topics of librealsense
 _FILES: dict[str, LogKind] = {".mcap": "bag", ".bag": "bag", ".sens": "scannet", ".r3d": "record3d"}
 _WITH_OPTIONS = ("bag", "lerobot", "tum")  # kinds whose path may be followed by ?KEY=VALUE&KEY=VALUE
 _HEAD = 2**20  # bytes of a JSON file that hold its description, or its first frames
@@ -95,7 +106,10 @@ def log_kind(uri: str | Path) -> LogKind:
 def _kind(path: Path) -> LogKind | None:
     """Return the kind of the recording at a path by its names, or None."""
     if not path.is_dir():
-        return _FILES.get(path.suffix.lower()) if path.exists() else None
+        suffix = path.suffix.lower()
+        if suffix in (".bag", ".db3") and _names(path, _REALSENSE):
+            return "realsense"
+        return _FILES.get(suffix) if path.exists() else None
     if (path / "metadata.yaml").exists():
         return "bag"
     if any((path / name).exists() for name in ("rgb.txt", "depth.txt")):
@@ -112,11 +126,13 @@ def _kind(path: Path) -> LogKind | None:
 
 
 def _names(file: Path, key: bytes) -> bool:
-    """Return whether a file exists and its beginning has a key."""
+    """Return whether a file exists and its beginning or its end, where bags list their topics, has a key."""
     if not file.is_file():
         return False
     with file.open("rb") as opened:
-        return key in opened.read(_HEAD)
+        head = opened.read(_HEAD)
+        opened.seek(max(0, file.stat().st_size - _HEAD))
+        return key in head or key in opened.read(_HEAD)
 
 
 def map_file(path: str | Path) -> Path:

@@ -21,7 +21,7 @@ from websockets.sync.server import Server, ServerConnection, serve
 from splatbot.protocols import Array
 
 ACTION = "/joint_trajectory_controller/follow_joint_trajectory"
-_PERIOD_S = 0.004
+_PERIOD_S = 0.008
 _SUCCEEDED, _CANCELED, _ABORTED = {1: 3, 2: 4}, {1: 2, 2: 5}, {1: 4, 2: 6}
 _REJECTED_1 = 5
 
@@ -223,13 +223,14 @@ class FakeRosArm:
     def _control(self, goal: Goal, t: float, ticks: int) -> None:
         faults = self.behaviour
         desired = quintic(goal.times, goal.points, t)
+        period = t - self.commands[-1][0] if self.commands else _PERIOD_S
         self.commands.append(np.array([t, *desired]))
         before = self.position
-        share = 1.0 - np.exp(-_PERIOD_S / faults.lag) if faults.lag else 1.0
+        share = 1.0 - np.exp(-period / faults.lag) if faults.lag else 1.0
         self.position = before + share * (desired - before)
-        self.velocity = (self.position - before) / _PERIOD_S
+        self.velocity = (self.position - before) / period
         error = np.abs(desired - self.position)
-        if ticks % 5 == 0:
+        if ticks % 4 == 0:
             self._feedback(goal)
         self.stalled = self.stalled or t >= faults.stall_at
         if t >= faults.drop_at:

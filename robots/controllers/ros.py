@@ -20,7 +20,7 @@ from splatbot.robots.controllers.rosbridge import Operation, RosbridgeLink
 
 _PERIOD_S = 0.01
 _ACCEPT_S = 2.0  # [s] in which a goal must be accepted
-_SETTLE_S = 1.0  # [s] in which the joint states must show that the arm rests
+_SETTLE_S = 2.0  # [s] in which the joint states must show that the arm rests
 _MAX_POINTS = 10_000  # of one goal: some 5 MB, where rosbridge_server takes 10 MB
 _DIALECTS: dict[int, type[Ros1Action] | type[Ros2Action]] = {1: Ros1Action, 2: Ros2Action}
 

@@ -40,7 +40,8 @@ def open_log(
 
     Args:
         uri: a folder in TUM, Replica, 7-Scenes, Open3D, ScanNet or Nerfstudio layout, or a `.sens` or `.r3d` file. A
-            recording of ROS topics is an `.mcap`, a rosbag2 folder or a `.bag`. Select one of several cameras by
+            recording of RealSense is a `.db3` or `.bag`. A recording of ROS topics is an `.mcap`, a rosbag2 folder or a
+            `.bag`. Select one of several cameras by
             `FILE?color=TOPIC&depth=TOPIC&info=TOPIC`. In a LeRobot dataset, `FOLDER?episode=N&color=KEY&depth=KEY`
             selects an episode and a camera. In TUM folders and recordings of ROS topics, `?pair_within=0.05` is the
             largest difference [s] of the stamps of colour and depth, 0.02 by default. Generated logs have the form
@@ -82,6 +83,12 @@ def _open_bag(uri: str, camera: str | Path | Calibration | None, joint_delay: fl
     return BagLog(path, camera=camera, options=options, joint_delay=joint_delay)
 
 
+def _open_realsense(path: str) -> Log:
+    from splatbot.logs.realsense import RealSenseLog  # imports rosbags
+
+    return RealSenseLog(path)
+
+
 def _open_lerobot(uri: str, camera: str | Path | Calibration | None, joint_delay: float) -> Log:
     from splatbot.logs.lerobot_packages import require_lerobot
 
@@ -96,4 +103,5 @@ _OWN_CAMERAS: dict[LogKind, Callable[[str], Log]] = {
     "synthetic": _open_synthetic,
     "scannet": ScanNetLog,
     "record3d": Record3dLog,
+    "realsense": _open_realsense,
 }

@@ -46,7 +46,7 @@ class Scene:
 
     def __init__(self, arm: FakeRosArm) -> None:
         self.arm = arm
-        self.controller = connect_arm(f"ros:{arm.address}{ACTION}?update_rate=1000", PANDA)
+        self.controller = connect_arm(f"ros:{arm.address}{ACTION}?update_rate=1000&max_age=3&lag=3", PANDA)
         self.store = MapStore()
         workspace = Workspace(T_world_base=pose_from_quat((0, 0, 0), (1, 0, 0, 0)))
         self.served = self.store.add(
