@@ -212,6 +212,11 @@ class MaskedSource:
         self._live, self._closed = isinstance(source, FrameSource), threading.Event()
         self.name, self.uri = str(getattr(source, "name", "")), str(getattr(source, "uri", ""))
 
+    @property
+    def dropped(self) -> int:
+        """Return the number of frames that a camera lost; 0 for a log."""
+        return self._source.dropped if isinstance(self._source, FrameSource) else 0
+
     def __iter__(self) -> Iterator[Frame]:
         for frame in self._source:
             if self._closed.is_set():

@@ -33,6 +33,11 @@ class SteadyCamera:
         self._camera, self._wait_s, self._report = camera, wait_s, report
         self._closed = threading.Event()
 
+    @property
+    def dropped(self) -> int:
+        """Return the number of frames that the camera lost."""
+        return self._camera.dropped
+
     def __iter__(self) -> Iterator[Frame]:
         gone_at: float | None = None
         while not self._closed.is_set():

@@ -276,6 +276,11 @@ class FrameSource(Protocol):
         """URI that opens the camera."""
         ...
 
+    @property
+    def dropped(self) -> int:
+        """Number of frames that a slow reader or the transfer lost."""
+        ...
+
     def __iter__(self) -> Iterator[Frame]:
         """Yield frames from now on.
 

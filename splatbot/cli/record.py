@@ -83,4 +83,5 @@ def _record_camera(uri: str, out: Path, seconds: float | None, max_frames: int |
         pass  # the normal end
     finally:
         recorded.close()
-    return f"{len(recorded)} frames in {time.monotonic() - begun:.1f} s"
+    lost = f", {recorded.missed} lost by the camera" if recorded.missed else ""
+    return f"{len(recorded)} frames in {time.monotonic() - begun:.1f} s{lost}"

@@ -85,6 +85,11 @@ class RecordedCamera(LogBase):
         """Return whether the camera delivers no further frame."""
         return self._ended
 
+    @property
+    def missed(self) -> int:
+        """Return the number of frames that the camera lost before they were recorded."""
+        return self._camera.dropped
+
     def __len__(self) -> int:
         return self._count
 

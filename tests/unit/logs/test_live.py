@@ -23,7 +23,7 @@ from tests.conftest import MakeLog
 class GivenFrames:
     """A camera that delivers given frames at once."""
 
-    name, uri = "given", "given://"
+    name, uri, dropped = "given", "given://", 0
 
     def __init__(self, frames: list[Frame]) -> None:
         self._frames = frames
