@@ -175,11 +175,9 @@ class LiveController:
         certify_motion(motion.motion, self._body, None)  # the limits of this robot, once more
         deviation, margin = self.deviation(motion), motion.arm.margin
         if not deviation.sphere <= CERTIFICATION.eps + margin:
-            text = (
-                f"moves the arm up to {1e3 * deviation.sphere:.3f} mm ({deviation.joint:.1e} rad) away from its curve."
-            )
-            need = 1e3 * deviation.sphere
-            hint = f"plan with a margin of {need:.1f} mm or more, slow the motion, or raise update_rate"
+            most = 1e3 * deviation.sphere
+            text = f"moves the arm up to {most:.3f} mm ({deviation.joint:.1e} rad) away from its curve."
+            hint = f"plan with a margin of {most:.2f} mm or more, slow the motion, or raise update_rate"
             raise ControllerError(text, field="motion", hint=hint)
 
     def _follow(self, motion: CertifiedMotion) -> bool:

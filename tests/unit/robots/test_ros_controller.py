@@ -161,7 +161,7 @@ def test_a_motion_is_refused_where_its_set_points_leave_the_certified_clearance(
         tight = certify_motion(trajectory, ARM, None)
         need = controller.deviation(tight).sphere
         assert 3e-4 < need < 5e-4
-        with pytest.raises(ControllerError, match=r"margin of 0\.4 mm"):
+        with pytest.raises(ControllerError, match=r"margin of 0\.40 mm"):
             controller.send(tight)
         roomy = certify_motion(trajectory, RobotSpheres(PANDA, margin=1e-3), None)
         assert follow(controller, roomy)
