@@ -52,7 +52,7 @@ class SteadyCamera:
             except DeviceError as error:
                 if gone_at is None:
                     gone_at = time.monotonic()
-                    _log.warning("%s It is opened again for %g s.", error, self._wait_s)
+                    _log.warning("%s. It is opened again for %g s", str(error).rstrip("."), self._wait_s)
                     self._report(f"The camera {error.message} It is opened again for {self._wait_s:g} s.")
                 if time.monotonic() - gone_at >= self._wait_s:
                     raise

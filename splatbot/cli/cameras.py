@@ -46,4 +46,6 @@ def open_recorded(
 
     if seconds is not None and not 0 < seconds < 1e6:
         raise InputError(f"is {seconds}.", field="--seconds", hint="give seconds, above 0")
+    if uri.startswith("replay:") and Path(uri.removeprefix("replay:").partition("?")[0]).resolve() == path.resolve():
+        raise InputError("is the recording that is replayed.", file=path, field="--out", hint="name another place")
     return RecordedCamera(open_camera(uri), path, max_frames=max_frames, seconds=seconds, overwrite=overwrite)

@@ -116,9 +116,12 @@ def map_log_command(
 
     from splatbot.cli.map_page import page_of_map
     from splatbot.cli.progress import progress_display
+    from splatbot.logs.mcap import recover_mcap
     from splatbot.robots.in_view import open_without_robot
     from splatbot.run import map_log
 
+    if resume is not None:
+        recover_mcap(resume / RECORDING)  # of a camera whose run was killed
     saved = _saved_run(resume, localise)
     if resume is not None and saved is not None:
         log, camera, out = log or saved.place.uri, camera or saved.place.camera, out or resume
@@ -188,7 +191,7 @@ def _check(
 def _check_overwrite(out: Path | None, *, overwrite: bool) -> None:
     if out is None or overwrite:
         return
-    found = [name for name in (MAP_NAME, "metrics.json", "trajectory.tum", "state") if (out / name).exists()]
+    found = [name for name in (MAP_NAME, RECORDING, "metrics.json", "trajectory.tum", "state") if (out / name).exists()]
     if found:
         hint = f"give another folder, --overwrite to replace it, or --resume {out} to continue it"
         raise InputError(f"holds a run already ({', '.join(found)}).", file=out, field="--out", hint=hint)

@@ -72,16 +72,14 @@ def record(
 
 def _record_camera(uri: str, out: Path, seconds: float | None, max_frames: int | None, quiet: bool) -> str:
     """Record a camera until it ends or Ctrl-C, and describe the recording."""
+    from splatbot.run.interrupts import Interrupts
+
     recorded = open_recorded(uri, out, max_frames=max_frames, seconds=seconds)
     begun = time.monotonic()
-    try:
-        with steps(quiet) as show:
-            for number, _ in recorded.arrivals():
-                elapsed = time.monotonic() - begun
-                show(f"recording: frame {number + 1}, {number / max(elapsed, 0.1):.1f} frames/s; Ctrl-C ends it")
-    except KeyboardInterrupt:
-        pass  # the normal end
-    finally:
-        recorded.close()
+    with Interrupts() as interrupts, steps(quiet) as show:
+        interrupts.when_requested = recorded.end  # Ctrl-C is the normal end
+        for number, _ in recorded.arrivals():
+            elapsed = time.monotonic() - begun
+            show(f"recording: frame {number + 1}, {number / max(elapsed, 0.1):.1f} frames/s; Ctrl-C ends it")
     lost = f", {recorded.missed} lost by the camera" if recorded.missed else ""
     return f"{len(recorded)} frames in {time.monotonic() - begun:.1f} s{lost}"

@@ -237,7 +237,8 @@ class BagLog(StampedLog):
                 seen[key] += 1
         except Exception as error:
             raise self._damaged(error) from error
-        return {topic: self._distinct(topic, entries) for topic, entries in found.items()}
+        depths = sorted(found.pop(self._depth, ()), key=lambda entry: entry.stamp)
+        return {self._depth: depths} | {topic: self._distinct(topic, entries) for topic, entries in found.items()}
 
     def _distinct(self, topic: str, entries: list[_Entry]) -> list[_Entry]:
         """Return the entries by stamp; of those with one stamp, the first that was received."""
@@ -250,7 +251,12 @@ class BagLog(StampedLog):
         return sorted(first.values(), key=lambda e: e.stamp)
 
     def _pair(self) -> list[tuple[_Entry, _Entry]]:
+        """Pair images that were received at one time, as splatbot writes them; else those nearest by their stamps."""
         colors, depths = self._index[self._color], self._index[self._depth]
+        together = {entry.received: entry for entry in depths}
+        if len(together) == len(depths) and all(entry.received in together for entry in colors):
+            return [(entry, together[entry.received]) for entry in colors]
+        depths = self._distinct(self._depth, depths)
         a, b = (np.array([entry.stamp for entry in entries]) for entries in (colors, depths))
         pairs = [(colors[i], depths[j]) for i, j in associate(a, b, self._pair_within)]
         if not pairs:

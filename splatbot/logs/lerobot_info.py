@@ -94,7 +94,7 @@ class DatasetInfo:
         unit = _details(self.features[key]).get("depth_unit")
         if unit is None:
             return None
-        if unit not in UNITS:
+        if not isinstance(unit, str) or unit not in UNITS:
             raise self.bad(f"features.{key}.info.depth_unit", f"is {unit!r:.40}", 'write "m" or "mm"')
         return UNITS[unit]
 

@@ -16,7 +16,13 @@ from splatbot.frame import Frame
 from splatbot.logs.base import Log
 from splatbot.logs.mcap_storage import CheckedStorage, CheckedWriter, recover, write_checksums
 from splatbot.logs.record import Progress
-from splatbot.logs.ros_frames import camera_info_message, image_message, joint_state_message, pose_stamped_message
+from splatbot.logs.ros_frames import (
+    camera_info_message,
+    image_message,
+    joint_state_message,
+    pose_stamped_message,
+    to_nanoseconds,
+)
 from splatbot.logs.ros_types import Message, to_cdr, type_of, typestore
 
 COLOR, DEPTH, INFO = "/camera/color/image_raw", "/camera/depth/image_raw", "/camera/color/camera_info"
@@ -29,14 +35,18 @@ class McapFile(AbstractContextManager["McapFile"]):
     Until then the messages are in the folder `.NAME.partial` next to it. After a crash the next recording of that name
     first recovers its messages into `NAME.recovered-N.mcap`.
 
+    Args:
+        path: the file.
+        overwrite: replace an existing file, when the new one is complete.
+
     Raises:
         LogError: the file exists, another process records into it, or its folder cannot be written to.
     """
 
-    def __init__(self, path: str | Path) -> None:
+    def __init__(self, path: str | Path, *, overwrite: bool = False) -> None:
         self.path = Path(path)
         self._partial = self.path.with_name(f".{self.path.name}.partial")
-        if self.path.exists():
+        if self.path.exists() and not overwrite:
             raise LogError("exists already.", file=self.path, hint="choose another name")
         self._topics: dict[tuple[str, str], Any] = {}
         try:
@@ -83,6 +93,19 @@ class McapFile(AbstractContextManager["McapFile"]):
         self.close()
 
 
+def recover_mcap(path: str | Path) -> None:
+    """Give the recording that a killed process left its name, if there is one and no file has the name.
+
+    Raises:
+        LogError: another process records into it.
+        OSError: the folder cannot be written to.
+    """
+    wanted = Path(path)
+    partial = wanted.with_name(f".{wanted.name}.partial")
+    if not wanted.exists() and partial.exists():
+        recover(partial, wanted, name=wanted)
+
+
 def record_mcap(log: Log, path: str | Path, *, progress: Progress | None = None) -> Path:
     """Write a log's frames, intrinsics, joints, masks and reference poses; reading returns bit-identical frames.
 
@@ -97,7 +120,7 @@ def record_mcap(log: Log, path: str | Path, *, progress: Progress | None = None)
     truth = log.ground_truth
     with McapFile(path) as out:
         for stamp, T in [] if truth is None else zip(truth.stamps.tolist(), truth.T_world_camera, strict=True):
-            out.write(TRUTH, pose_stamped_message(stamp, T, "world"), _nanoseconds(stamp))
+            out.write(TRUTH, pose_stamped_message(stamp, T, "world"), to_nanoseconds(stamp))
         for number, frame in enumerate(log, 1):
             write_frame(out, frame)
             if progress is not None:
@@ -111,7 +134,7 @@ def write_frame(out: McapFile, frame: Frame) -> None:
     Raises:
         OSError: the disk is full or not available.
     """
-    at = _nanoseconds(frame.stamp)
+    at = to_nanoseconds(frame.stamp)
     out.write(INFO, camera_info_message(frame.stamp, frame.camera), at)
     out.write(COLOR, image_message(frame.stamp, frame.rgb), at)
     out.write(DEPTH, image_message(frame.stamp + frame.depth_delay, frame.depth), at)
@@ -119,7 +142,3 @@ def write_frame(out: McapFile, frame: Frame) -> None:
         out.write(MASK, image_message(frame.stamp, frame.mask), at)
     if frame.joints is not None:
         out.write(JOINTS, joint_state_message(frame.stamp, frame.joints, frame.joint_names), at)
-
-
-def _nanoseconds(stamp: float) -> int:
-    return round(stamp * 1e9)

@@ -148,10 +148,11 @@ class CheckedWriter(Writer):
     STORAGE_PLUGINS: ClassVar = {**Writer.STORAGE_PLUGINS, StoragePlugin.MCAP: CheckedStorage}  # type: ignore[misc]
 
 
-def recover(partial: Path, path: Path) -> None:
+def recover(partial: Path, path: Path, *, name: Path | None = None) -> None:
     """Save the messages that a killed process left in ``partial``, and free that name.
 
-    They become ``NAME.recovered-N.mcap`` next to ``path``. A folder that cannot be recovered is renamed, never deleted.
+    They become the file ``name``, or ``NAME.recovered-N.mcap`` next to ``path``. A folder that cannot be recovered is
+    renamed, never deleted.
 
     Raises:
         LogError: another process records into it.
@@ -159,7 +160,7 @@ def recover(partial: Path, path: Path) -> None:
     """
     if not partial.exists():
         return
-    target = _free(path, "recovered")
+    target = name or _free(path, "recovered")
     try:
         count = _recover(partial, target)
     except (ReaderError, OSError, ValueError, KeyError, struct.error, EOFError) as error:

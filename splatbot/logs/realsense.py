@@ -46,7 +46,7 @@ class RealSenseLog(StampedLog):
         self.name = self.path.stem
         if not self.path.exists():
             raise LogError("does not exist.", file=self.path, field="log", hint="check the path")
-        self._file: RealSenseFile = (SqliteFile if self.path.suffix == ".db3" else BagFile)(self.path)
+        self._file: RealSenseFile = (SqliteFile if self.path.suffix.lower() == ".db3" else BagFile)(self.path)
         self._color, self._depth = self._stream("Color"), self._stream("Depth")
         units = self._file.depth_units(self._depth)
         if units is not None and not 1e-6 <= units <= 1.0:

@@ -21,6 +21,7 @@ from splatbot.protocols import Array
 DEVICE = "/device_0/sensor_"  # beginning of the topics of the first device
 MAX_IMAGES = 1_000_000
 _MAX_IMAGE_BYTES = 2**27
+_MAX_TEXT = 2**14  # bytes
 _AGAIN = "record it again, or convert it with rs-convert"
 _UNITS = "Depth_Units"
 
@@ -77,15 +78,16 @@ class BagFile:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._reader = AnyReader([path])
         try:
+            self._reader = AnyReader([path])
             self._reader.open()
         except Exception as error:  # damaged bytes raise any exception in the reader
             raise _damaged(path, error) from error
 
     def streams(self) -> list[str]:
         """Implement :class:`RealSenseFile`."""
-        topics = {c.topic for c in self._reader.connections if c.msgtype == "sensor_msgs/msg/Image" and c.msgcount}
+        images = [c for c in self._reader.connections if c.msgtype == "sensor_msgs/msg/Image" and c.msgcount]
+        topics = {c.topic for c in images if c.topic.startswith(DEVICE)}
         return sorted(topic.removesuffix("/image/data") for topic in topics)
 
     def images(self, stream: str) -> Images:
@@ -151,34 +153,34 @@ class SqliteFile:
         try:
             self._file = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True, check_same_thread=False)
             rows = self._file.execute("SELECT id, name, type FROM topics LIMIT 10000").fetchall()
-        except sqlite3.Error as error:
+            self._topics: dict[str, tuple[int, str]] = {
+                str(name): (int(number), str(kind)) for number, name, kind in rows
+            }
+        except (sqlite3.Error, TypeError, ValueError) as error:
             raise _damaged(path, error) from error
-        self._topics: dict[str, tuple[int, str]] = {str(name): (int(number), str(kind)) for number, name, kind in rows}
         if not any(name.startswith(DEVICE) for name in self._topics):
             hint = "name the folder that holds it and metadata.yaml"
             raise LogError("is one file of a rosbag2 recording.", file=path, field="log", hint=hint)
 
     def streams(self) -> list[str]:
         """Implement :class:`RealSenseFile`."""
-        return sorted(name.partition("/image/data")[0] for name in self._topics if "/image/data" in name)
+        images = [name for name in self._topics if name.startswith(DEVICE) and "/image/data" in name]
+        return sorted(name.partition("/image/data")[0] for name in images)
 
     def images(self, stream: str) -> Images:
         """Implement :class:`RealSenseFile`; stamps are of the metadata, since headers have the time of recording."""
         rows = self._rows(
-            "SELECT id, timestamp FROM messages WHERE topic_id = ? ORDER BY timestamp, id LIMIT ?",
+            "SELECT id, CAST(timestamp AS INTEGER) FROM messages WHERE topic_id = ? ORDER BY timestamp, id LIMIT ?",
             self._image_topic(stream),
         )
-        texts = [
-            self._deserialize(f"{stream}/image/metadata", data).data
-            for (data,) in self._rows(
-                "SELECT data FROM messages WHERE topic_id = ? ORDER BY timestamp, id LIMIT ?",
-                f"{stream}/image/metadata",
-            )
-        ]
+        topic = f"{stream}/image/metadata"
+        short = f"topic_id = ? AND length(data) <= {_MAX_TEXT}"
+        query = f"SELECT data FROM messages WHERE {short} ORDER BY timestamp, id LIMIT ?"
+        texts = [self._string(topic, data) for (data,) in self._rows(query, topic)]
         if len(texts) == len(rows):
             stamps = [self._number(pairs(text), "timestamp", stream) / 1e3 for text in texts]
         else:
-            stamps = [at / 1e9 for _, at in rows]
+            stamps = [(at or 0) / 1e9 for _, at in rows]
         return Images(stamps, [number for number, _ in rows])
 
     def image(self, stream: str, place: Any) -> Message:
@@ -194,7 +196,9 @@ class SqliteFile:
         width, height, fx, fy, cx, cy = (
             self._number(values, key, stream) for key in ("width", "height", "fx", "fy", "ppx", "ppy")
         )
-        lens = [float(number) for number in values.get("coeffs", "").split(",") if number]
+        lens = [
+            self._number({"coeffs": text}, "coeffs", stream) for text in values.get("coeffs", "").split(",") if text
+        ]
         model = values.get("model", "")
         K = np.array([fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0])
         return SimpleNamespace(k=K, d=np.array(lens), distortion_model=model, width=width, height=height)
@@ -210,7 +214,7 @@ class SqliteFile:
                 np.array([float(number) for number in values[key].split(",")]) for key in ("rotation", "translation")
             )
             T = np.eye(4)
-            T[:3, :3], T[:3, 3] = rotation.reshape(3, 3).T, translation
+            T[:3, :3], T[:3, 3] = rotation.reshape(3, 3).T, translation.reshape(3)
         except (KeyError, ValueError) as error:
             raise LogError("is no transform.", file=self.path, field=topics[0], hint=_AGAIN) from error
         return T
@@ -227,7 +231,13 @@ class SqliteFile:
         rows = self._rows("SELECT data FROM messages WHERE topic_id = ? ORDER BY id LIMIT min(1, ?)", topic)
         if not rows:
             raise LogError("holds no message.", file=self.path, field=topic, hint=_AGAIN)
-        return str(self._deserialize(topic, rows[0][0]).data)
+        return self._string(topic, rows[0][0])
+
+    def _string(self, topic: str, data: bytes) -> str:
+        text = getattr(self._deserialize(topic, data), "data", None)
+        if not isinstance(text, str):
+            raise LogError("holds no texts.", file=self.path, field=topic, hint=_AGAIN)
+        return text
 
     def _rows(self, query: str, topic: str) -> list[Any]:
         if topic not in self._topics:

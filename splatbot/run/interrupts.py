@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 from typing import Any
@@ -22,6 +22,7 @@ class Interrupts:
 
     def __init__(self) -> None:
         self.requested: int | None = None
+        self.when_requested: Callable[[], None] | None = None  # as the end of a camera that delivers no frame
         self._count = 0
         self._raises_after: int | None = None
         self._previous: dict[signal.Signals, Any] = {}
@@ -63,6 +64,8 @@ class Interrupts:
     def _handle(self, number: int, _frame: FrameType | None) -> None:
         self._count += 1
         self.requested = self.requested or number
+        if self.when_requested is not None:
+            self.when_requested()
         self._raise_if_requested()
 
     def _raise_if_requested(self) -> None:

@@ -112,6 +112,7 @@ class FrameLoop:
         Raises:
             KeyboardInterrupt: A signal arrived during the wait for a frame, or a callback raised it.
         """
+        interrupts.when_requested = self.source.end
         with closing(iter(self.source)) as arrivals:
             while interrupts.requested is None:
                 with interrupts.interruptible(after=1):  # a camera may be silent for long

@@ -52,6 +52,9 @@ class LogFrames:
         """Return whether the frames come from a camera, which Ctrl-C ends."""
         return False
 
+    def end(self) -> None:
+        """End the frames of a camera; a log needs no end."""
+
     def __iter__(self) -> Generator[Arrival, None, None]:
         return (read(self.log, index) for index in range(self.first, self.total))
 
@@ -112,6 +115,10 @@ class CameraFrames(LogFrames):
     def live(self) -> bool:
         """See :class:`LogFrames`."""
         return True
+
+    def end(self) -> None:
+        """End the stream of the camera."""
+        self.log.end()
 
     def __iter__(self) -> Generator[Arrival, None, None]:
         expected = 0

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import json
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +15,7 @@ import pytest
 from splatbot.cli import main
 from splatbot.logs import open_log
 from tests.terminal import at_a_terminal
+from tests.waiting import until
 
 CAMERA = "replay:synthetic:tabletop?frames=400&width=160&height=120&speed=1"
 
@@ -44,6 +49,42 @@ def test_a_mapped_camera_is_its_recording_for_other_commands(tmp_path: Path) -> 
     assert main(["map", CAMERA, "--out", str(out), "--max-frames", "3", "--quiet", "--no-report"]) == 2
     assert main(["map", CAMERA, "--out", str(out), "--max-frames", "3", "--quiet", "--no-report", "--overwrite"]) == 0
     assert len(open_log(out / "recording.mcap")) == 3
+
+
+def test_a_camera_that_drops_frames_is_scored_and_resumed_by_the_numbers_of_its_recording(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    words = ["--out", str(out), "--max-frames", "24", "--quiet", "--no-report"]
+    assert main(["map", f"{CAMERA}&drop=0.3", *words]) == 0
+    recording = open_log(out / "recording.mcap")
+    rows = [json.loads(line) for line in (out / "frames.jsonl").read_text().splitlines()]
+    assert sorted(row["index"] for row in rows) == list(range(24))
+    assert all(row["stamp"] in (None, recording[row["index"]].stamp) for row in rows)
+    assert main(["eval", str(out)]) == 0
+    assert main(["map", "--resume", str(out), "--quiet", "--no-report"]) == 0
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_one_signal_ends_a_silent_camera(tmp_path: Path, number: signal.Signals) -> None:
+    words = ["record", f"{CAMERA}&stall=5&stall_s=300", "--out", str(tmp_path / "a.mcap")]
+    process = subprocess.Popen([sys.executable, "-m", "splatbot", *words], stderr=subprocess.DEVNULL)
+    until(lambda: any(tmp_path.rglob("*.mcap")), 60)
+    time.sleep(2)
+    process.send_signal(number)
+    assert process.wait(30) == 0
+    assert len(open_log(tmp_path / "a.mcap")) == 5
+
+
+def test_a_killed_run_of_a_camera_is_resumed_with_its_recording(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    words = ["map", CAMERA, "--out", str(out), "--save-every", "1", "--no-report", "--quiet"]
+    process = subprocess.Popen([sys.executable, "-m", "splatbot", *words])
+    until((out / "state" / "run.state").exists, 90)
+    time.sleep(2)
+    process.kill()
+    process.wait()
+    assert not (out / "recording.mcap").exists()
+    assert main(["map", "--resume", str(out), "--quiet", "--no-report"]) == 0
+    assert len(open_log(out / "recording.mcap")) >= 1
 
 
 def test_a_camera_that_is_lost_keeps_map_and_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -13,7 +13,7 @@ import pytest
 
 from splatbot.errors import DeviceError, LogError
 from splatbot.frame import Frame
-from splatbot.logs import open_log
+from splatbot.logs import live, open_log
 from splatbot.logs.live import RecordedCamera
 from splatbot.robots.cameras import ReplayCamera
 from splatbot.robots.cameras.replay import ReplayOptions
@@ -55,13 +55,26 @@ def test_a_slow_reader_misses_frames_but_the_recording_has_all(make_log: MakeLog
 
 
 def test_frames_of_any_delay_between_colour_and_depth_keep_their_numbers(make_log: MakeLog, tmp_path: Path) -> None:
-    frames = [replace(frame, depth_delay=0.045) for frame in open_log(make_log(5, period=0.1))]
-    recorded = RecordedCamera(GivenFrames(frames), tmp_path / "a.mcap")
-    list(recorded.arrivals())
-    assert len(recorded) == 5
-    for k, frame in enumerate(frames):
-        assert recorded[k].depth_delay == pytest.approx(0.045, abs=1e-9)
-        np.testing.assert_array_equal(recorded[k].depth, frame.depth)
+    source = list(open_log(make_log(5, period=0.1)))
+    for name, delays in (("late", [0.08] * 5), ("early", [-0.07] * 5), ("repeated", [0.0, 0.02, -0.08, 0.0, 0.0])):
+        frames = [replace(frame, depth_delay=delay) for frame, delay in zip(source, delays, strict=True)]
+        recorded = RecordedCamera(GivenFrames(frames), tmp_path / f"{name}.mcap")
+        list(recorded.arrivals())
+        for log in (recorded, open_log(tmp_path / f"{name}.mcap")):
+            assert [frame.depth_delay for frame in log] == pytest.approx(delays, abs=1e-8)
+            for k, frame in enumerate(log):
+                np.testing.assert_array_equal(frame.depth, source[k].depth)
+
+
+def test_frames_have_the_numbers_and_stamps_of_the_recording(make_log: MakeLog, tmp_path: Path) -> None:
+    source = list(open_log(make_log(6)))
+    unix = [1.7e9 + k / 3 + 1e-7 for k in range(6)]
+    frames = [replace(frame, stamp=at, index=10 * k) for k, (frame, at) in enumerate(zip(source, unix, strict=True))]
+    recorded = RecordedCamera(GivenFrames([frames[0], *frames]), tmp_path / "a.mcap")
+    seen = [(frame.index, number, frame.stamp) for number, frame in recorded.arrivals()]
+    read = [frame.stamp for frame in open_log(tmp_path / "a.mcap")]
+    assert all(index == number and stamp == read[index] for index, number, stamp in seen)
+    assert read == pytest.approx(unix, abs=2e-7)
 
 
 def test_it_ends_after_a_number_of_frames_or_seconds(make_log: MakeLog, tmp_path: Path) -> None:
@@ -91,7 +104,43 @@ def test_frames_whose_stamps_do_not_increase_are_left_out(
         recorded = RecordedCamera(GivenFrames(again), tmp_path / "a.mcap")
         list(recorded.arrivals())
     assert len(recorded) == len(open_log(tmp_path / "a.mcap")) == 4
-    assert caplog.text.count("left out") == 2
+    assert caplog.text.count("left out") == 1  # once for frames in a row
+
+
+def test_a_clock_that_was_set_back_ends_the_recording(
+    make_log: MakeLog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(live, "_LATE_S", 0.2)
+    frames = list(open_log(make_log(3)))
+
+    class SetBack(GivenFrames):
+        def __iter__(self) -> Iterator[Frame]:
+            yield from frames
+            while True:
+                time.sleep(0.02)
+                yield replace(frames[0], stamp=-3600.0)
+
+    recorded = RecordedCamera(SetBack(frames), tmp_path / "a.mcap")
+    with pytest.raises(LogError, match="went back by 3600"):
+        list(recorded.arrivals())
+    assert len(open_log(tmp_path / "a.mcap")) == 3
+
+
+def test_a_silent_camera_ends_after_its_seconds(make_log: MakeLog, tmp_path: Path) -> None:
+    camera = ReplayCamera(open_log(make_log(4)), ReplayOptions(stall=2, stall_s=60))
+    recorded, begun = RecordedCamera(camera, tmp_path / "a.mcap", seconds=0.5), time.monotonic()
+    list(recorded.arrivals())
+    assert time.monotonic() - begun < 5
+    assert len(recorded) == 2
+
+
+def test_an_existing_recording_is_replaced_only_by_a_complete_one(make_log: MakeLog, tmp_path: Path) -> None:
+    log = open_log(make_log(3))
+    list(RecordedCamera(ReplayCamera(log), tmp_path / "a.mcap").arrivals())
+    again = RecordedCamera(ReplayCamera(log), tmp_path / "a.mcap", max_frames=1, overwrite=True)
+    assert len(open_log(tmp_path / "a.mcap")) == 3
+    list(again.arrivals())
+    assert len(open_log(tmp_path / "a.mcap")) == 1
 
 
 def test_images_of_another_camera_end_it_with_its_recording_kept(make_log: MakeLog, tmp_path: Path) -> None:

@@ -126,9 +126,7 @@ def test_images_are_paired_within_the_seconds_of_the_address(make_log: MakeLog, 
     assert [frame.depth_delay for frame in log] == pytest.approx([0.05] * 4, abs=1e-6)
     assert log.uri == f"{folder}?pair_within=0.06"
     record_mcap(log, tmp_path / "a.mcap")
-    with pytest.raises(LogError, match=r"pair_within=0\.05"):
-        open_log(tmp_path / "a.mcap")
-    assert len(open_log(f"{tmp_path / 'a.mcap'}?pair_within=0.06")) == 4
+    assert [frame.depth_delay for frame in open_log(tmp_path / "a.mcap")] == pytest.approx([0.05] * 4, abs=1e-6)
     for wrong in ("pair_within=0", "pair_within=nan", "pair_within=100", "pair_within=x", "pair=1"):
         with pytest.raises(LogError, match="pair"):
             open_log(f"{folder}?{wrong}")
