@@ -94,7 +94,15 @@ class Arm:
     def send(self, motion: CertifiedMotion) -> None:
         """Begin a motion; the caller holds the lock."""
         with self.reading:
-            self.ready().send(motion)
+            controller = self.ready()
+            if self.real:
+                controller.reset()  # of an earlier fault; without effect while the arm may still move
+            controller.send(motion)
+
+    def stop(self) -> None:
+        """Stop a controller that exists, in any state."""
+        if self.controller is not None:
+            self.controller.stop()
 
     @property
     def busy(self) -> bool:
@@ -199,6 +207,9 @@ class Arms:
         stop = self._stop = EmergencyStop(by, time.time())
         self._last_stop = stop
         _log.warning("emergency stop by %s", by)
+        for arm in list(self._arms.values()):
+            if arm.real:  # at a fault, no motion is followed that would see the stop
+                threading.Thread(target=arm.stop, name="emergency stop", daemon=True).start()
         return stop
 
     def reset(self) -> None:
@@ -232,6 +243,10 @@ class Arms:
             raise ControllerError("is moving.", field=f"arm {name}", hint="stop it, or wait until it has arrived")
         try:
             motion = self._gate.certify(request, arm.robot)
+            self._check_running()  # a stop or the end of the lease during the certification
+            if self._last_stop is not last_stop:
+                raise MotionRefusedError("An emergency stop came meanwhile.", field="stop", hint="plan again")
+            self.leases.check(lease, name)
             arm.send(motion)
             work = partial(self._follow, arm, request, motion, lease, last_stop)
             abandoned = partial(self._abandon, arm)

@@ -262,6 +262,7 @@ class Runtime:
         self.draining = True
         self._deadline = min(self._deadline, time.monotonic() + self.settings.shutdown_s)
         self.jobs.stop()
+        self.arms.motions.stop()
         self.bus.close()
 
     def close(self) -> None:

@@ -131,25 +131,34 @@ class LiveController:
             raise ControllerError(f"begins {distance:.4f} from where the arm is.", field="motion", hint=hint)
         self._curve.clear()
         self._time = self._sampled = 0.0
-        self._begin(motion)
-        self._motion, self._stopping, self._state = motion, False, MotionState.MOVING
+        self._stopping = False
+        try:
+            self._begin(motion)
+        except BaseException:
+            with suppress(SplatbotError):
+                self._abort()
+            raise
+        self._motion, self._state = motion, MotionState.MOVING
+        if self._stopping:  # by another thread, while the motion was accepted
+            self.stop()
 
     def step(self) -> Feedback:
         """Wait for the end of one period; after :meth:`stop`, until the arm rests.
 
         An arm at rest whose state is unknown is reported as a fault while this lasts.
         """
-        problem = ""
+        problem, stopping = "", self._stopping
         if self._state is MotionState.MOVING and self._motion is not None:
             try:
-                if self._stopping:
+                if stopping:
                     self._await_rest()
                     self._state = MotionState.STOPPED
                 elif self._follow(self._motion):
                     self._state = MotionState.DONE
                 self._at = self._measured()
             except SplatbotError as error:
-                self._fail(error)
+                if stopping or not self._stopping:  # else the arm was stopped meanwhile: the next step waits for it
+                    self._fail(error)
         else:
             self._pass_period()
             problem = self._look()
@@ -158,15 +167,15 @@ class LiveController:
         return Feedback(self._time, at.position, at.velocity, desired, state, problem or self._fault)
 
     def stop(self) -> None:
-        """Command a stop at once; the next step waits until the arm rests."""
+        """Command a stop at once, in any state; the next step waits until the arm rests."""
         self._stopping = True
-        if self._state is MotionState.MOVING:
-            with suppress(SplatbotError):  # the next step reports a stop that the arm does not heed
-                self._abort()
+        with suppress(SplatbotError):  # the next step reports a stop that the arm does not heed
+            self._abort()
 
     def reset(self) -> None:
-        """Clear a fault; the next motion is refused while its cause remains."""
-        self._state, self._fault = MotionState.IDLE, ""
+        """Clear a fault, unless the arm may still move; the next motion is refused while its cause remains."""
+        if not self._may_move():
+            self._state, self._fault = MotionState.IDLE, ""
 
     def _check_motion(self, motion: CertifiedMotion) -> None:
         if motion.arm.robot.name != self.robot.name:
@@ -219,6 +228,10 @@ class LiveController:
                 return False
             time.sleep(min(0.002, self._period))
         return True
+
+    def _may_move(self) -> bool:
+        """Return whether a commanded motion may still run."""
+        raise NotImplementedError
 
     def _begin(self, motion: CertifiedMotion) -> None:
         """Command a motion, or raise a ControllerError."""

@@ -68,7 +68,7 @@ class RosController(LiveController):
         self._result: GoalNews | None = None
         self._news = threading.Condition()
         self._begun, self._losses = 0.0, 0
-        self._goals = RosbridgeLink(address, self._dialect.greeting, self._take_news)
+        self._goals = RosbridgeLink(address, self._greet_goals, self._take_news)
         try:
             self._reports = RosbridgeLink(address, self._greet, self._take_state)
         except BaseException:
@@ -110,7 +110,6 @@ class RosController(LiveController):
         except DeviceError as error:
             raise ControllerError(error.message, field=error.field, hint=error.hint) from error
         if not self._active and self._result is None:
-            self._abort()
             hint = f"check that a controller serves {self._action}"
             raise ControllerError(f"did not begin within {_ACCEPT_S:g} s.", field="goal", hint=hint)
         if self._result is not None and self._result.problem:
@@ -128,7 +127,18 @@ class RosController(LiveController):
         if self._result is None:
             return False
         distance = np.abs(self._measured().position - motion.reference(motion.duration)[0]).max()
-        return bool(distance <= self.options.start_tolerance)
+        if not distance <= self.options.goal_tolerance:
+            return False
+        self._goal = None
+        return True
+
+    def _may_move(self) -> bool:
+        """Return whether a goal may still run; it is over when the arm is seen at rest."""
+        if self._goal is not None and self._wait(
+            lambda: self._states.age <= self.options.max_age and self._states.rests, _SETTLE_S
+        ):
+            self._goal = None
+        return self._goal is not None
 
     def _abort(self) -> None:
         """Cancel the goal on both connections, and again with each of its feedbacks.
@@ -149,6 +159,7 @@ class RosController(LiveController):
 
         if not self._wait(rests, self.options.stop_time):
             raise ControllerError(f"does not rest {self.options.stop_time:g} s after the stop.", field="arm")
+        self._goal = None
 
     def _check_states(self) -> None:
         if self._states.age > self.options.max_age:
@@ -176,6 +187,11 @@ class RosController(LiveController):
             text = "was lost during the motion; the robot may go on to its end."
             raise DeviceError(text, field="connection", hint="look at the robot; the goal is cancelled on reconnection")
 
+    def _greet_goals(self) -> list[Operation]:
+        """Announce goals, and cancel one that ran when the connection was lost."""
+        cancels = [] if self._goal is None else [*self._dialect.greeting_to_cancel(), self._dialect.cancel_all()]
+        return [*self._dialect.greeting(), *cancels]
+
     def _greet(self) -> list[Operation]:
         """Subscribe to the states, and cancel a goal that ran when the connection was lost."""
         self._states.restart()
@@ -193,10 +209,10 @@ class RosController(LiveController):
             if news is None or news.goal != self._goal:
                 return
             if news.ended:
-                self._result, self._goal = news, None
+                self._result = news  # the goal counts as running until the arm rests: a bridge may report wrongly
             else:
                 self._active = True
             self._news.notify_all()
-        if self._cancelling:
+        if self._cancelling and not news.ended:
             with suppress(DeviceError):
                 self._abort()

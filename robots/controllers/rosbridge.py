@@ -111,5 +111,5 @@ class RosbridgeLink:
             operation = json.loads(text)
             if isinstance(operation, dict):
                 self._take(operation)
-        except (ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
+        except Exception as error:  # no message of a client may end the thread
             _log.warning("%s sent a message that has no effect (%s)", self._address, error)

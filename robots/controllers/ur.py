@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -13,6 +14,7 @@ import numpy as np
 from splatbot.errors import ControllerError, DeviceError, InputError
 from splatbot.planning.certify import CertifiedMotion
 from splatbot.protocols import RobotKinematics
+from splatbot.robots.controllers.deviation import Deviation, between_set_points
 from splatbot.robots.controllers.live import LiveController, LiveOptions, Measured
 
 _JOINTS = 6
@@ -78,16 +80,34 @@ class UrController(LiveController):
         self._control, self._receive = _connect(host, frequency)
         self._stamp, self._stamped = -1.0, 0.0
         self._steps = 0
-        self._at = self._measured()
+        self._commands = threading.RLock()  # no set point follows a stop
+        try:
+            self._at = self._measured()
+        except BaseException:
+            self.close()
+            raise
 
     def close(self) -> None:
         """Stop the arm, and end the connections."""
         with suppress(ControllerError):
-            if self._steps:
-                self._abort()
+            self._abort()
+        with suppress(ControllerError):
             self._call(self._control.stopScript)
         for interface in (self._control, self._receive):
-            interface.disconnect()
+            with suppress(ControllerError):
+                self._call(interface.disconnect)
+
+    def deviation(self, motion: CertifiedMotion) -> Deviation:
+        """Bound the deviation of the set points and of their smoothing by the robot.
+
+        The robot follows set points through a filter, which is not published. One of the first order is assumed. With
+        the time constant τ, the lookahead, it deviates by at most ``τ²/2 max |q''|``, apart from a delay on the curve.
+        """
+        smoothing = between_set_points(motion.motion.pieces(), motion.arm.reach, 2.0 * self._lookahead)
+        return super().deviation(motion) + smoothing
+
+    def _may_move(self) -> bool:
+        return self._steps > 0 and bool(np.abs(self._measured().velocity).max() > _RESTING)
 
     def _begin(self, motion: CertifiedMotion) -> None:
         self._check_states()
@@ -95,13 +115,20 @@ class UrController(LiveController):
 
     def _advance(self, motion: CertifiedMotion) -> float:
         self._check_states()
+        if self._steps == 0:
+            distance = float(np.abs(self._measured().position - motion.reference(0.0)[0]).max())
+            if not distance <= self.options.start_tolerance:
+                raise ControllerError(f"moved by {distance:.4f} before its motion began.", field="arm")
         self._steps += 1
         t = self._steps * self._period
         q = motion.reference(t)[0].tolist()
         begun = self._call(self._control.initPeriod)
-        # The second and the third argument, speed and acceleration, have no effect in ur_rtde.
-        if not self._call(self._control.servoJ, q, 0.0, 0.0, self._period, self._lookahead, self._gain):
-            raise ControllerError("was refused.", field="servoJ")
+        with self._commands:
+            if self._stopping:
+                return self._time
+            # The second and the third argument, speed and acceleration, have no effect in ur_rtde.
+            if not self._call(self._control.servoJ, q, 0.0, 0.0, self._period, self._lookahead, self._gain):
+                raise ControllerError("was refused.", field="servoJ")
         self._call(self._control.waitPeriod, begun)
         return t
 
@@ -116,8 +143,14 @@ class UrController(LiveController):
         return True
 
     def _abort(self) -> None:
-        self._call(self._control.servoStop, self._deceleration)
-        self._call(self._control.stopJ, self._deceleration)
+        """Stop servoing and brake; braking is tried although the first call fails."""
+        if self._steps == 0:
+            return
+        with self._commands:
+            try:
+                self._call(self._control.servoStop, self._deceleration)
+            finally:
+                self._call(self._control.stopJ, self._deceleration)
 
     def _await_rest(self) -> None:
         if not self._wait(lambda: bool(np.abs(self._measured().velocity).max() <= _RESTING), self.options.stop_time):
@@ -166,10 +199,10 @@ class UrController(LiveController):
             raise ControllerError(f"has not reported for {self._age():.2f} s.", field="arm")
 
     def _call(self, function: Callable[..., Any], *args: Any) -> Any:
-        """Call ur_rtde, whose errors are of the class RuntimeError."""
+        """Call ur_rtde; each of its errors is a ControllerError."""
         try:
             return function(*args)
-        except RuntimeError as error:
+        except Exception as error:
             raise ControllerError(f"{error}.", field="ur_rtde", hint="check the robot and the network") from error
 
 

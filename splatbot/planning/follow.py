@@ -55,16 +55,20 @@ def follow(
     controller.send(motion)
     feedback: list[Feedback] = []
     max_periods = int((motion.duration + _SETTLING_TIME) / controller.period) + 2
-    while len(feedback) < max_periods:
-        feedback.append(controller.step())
-        if feedback[-1].state is not MotionState.MOVING:
-            break
-        if stop is not None and stop(feedback[-1]):
+    try:
+        while len(feedback) < max_periods:
+            feedback.append(controller.step())
+            if feedback[-1].state is not MotionState.MOVING:
+                break
+            if stop is not None and stop(feedback[-1]):
+                controller.stop()
+                stop = None
+        if feedback[-1].state is MotionState.MOVING:  # the arm does not arrive in time
             controller.stop()
-            stop = None
-    if feedback[-1].state is MotionState.MOVING:  # the arm does not arrive in time
+            feedback.append(controller.step())
+    except BaseException:  # as Ctrl-C: an arm goes on by itself otherwise
         controller.stop()
-        feedback.append(controller.step())
+        raise
     last = feedback[-1]
     return Followed(
         last.state,

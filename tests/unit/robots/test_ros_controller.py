@@ -20,7 +20,7 @@ from splatbot.grasping.pick_types import PickOutcome
 from splatbot.planning import CertifiedMotion, JointTrajectory, WaypointMotion, certify_motion, time_path
 from splatbot.planning.cubics import CubicPieces
 from splatbot.planning.follow import follow
-from splatbot.protocols import Array, Controller, MotionState
+from splatbot.protocols import Array, Controller, Feedback, MotionState
 from splatbot.robots.controllers.arm_states import ArmStates
 from splatbot.robots.controllers.deviation import GoalPoints, between_set_points, of_quintics
 from splatbot.robots.controllers.live import LiveOptions
@@ -314,6 +314,27 @@ def test_a_lost_connection_is_a_fault_at_once_and_the_goal_is_cancelled_when_it_
         controller.reset()
         back = time_path(path_of(np.stack([arm.position, PANDA.home])), ARM, None)
         assert follow(controller, certify_motion(back.slowed(3.0), ARM, None))
+
+
+def test_an_interrupted_follow_cancels_the_goal(slow: CertifiedMotion) -> None:
+    def interrupt(feedback: Feedback) -> bool:
+        if feedback.time > 0.3:
+            raise KeyboardInterrupt
+        return False
+
+    with connected() as (controller, arm):
+        with pytest.raises(KeyboardInterrupt):
+            follow(controller, slow, stop=interrupt)
+        until(lambda: arm.cancels >= 1, 5.0)
+        until(lambda: stands(arm), 3.0)
+
+
+def test_a_stop_is_commanded_at_a_fault_too_until_the_arm_rests(slow: CertifiedMotion) -> None:
+    with connected(stall_at=0.4, options=FAST) as (controller, arm):
+        assert follow(controller, slow).state is MotionState.FAULT
+        cancels = arm.cancels
+        controller.stop()
+        until(lambda: arm.cancels > cancels, 5.0)
 
 
 def test_states_that_stall_in_the_middle_are_a_fault_and_cancel_the_goal(slow: CertifiedMotion) -> None:

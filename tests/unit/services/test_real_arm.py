@@ -12,7 +12,7 @@ import pytest
 
 from splatbot.cli.serve import serve
 from splatbot.collision import RobotSpheres
-from splatbot.errors import ControllerError, DeviceError, InputError
+from splatbot.errors import DeviceError, InputError
 from splatbot.gaussians import GaussianModel, Snapshot
 from splatbot.geometry import pose_from_quat
 from splatbot.planning import time_path
@@ -115,8 +115,6 @@ def test_a_lost_connection_ends_the_motion_as_failed(scene: Scene) -> None:
     job = scene.arms.send(REAL, scene.request(0.2, 20.0), lease=lease.id)
     assert "connection" in _ended(scene, job.id)
     until(lambda: scene.arm.cancels > 0, 5.0)
-    with pytest.raises(ControllerError):
-        scene.arms.send(REAL, scene.request(0.5, 2.0), lease="other")
 
 
 def test_clients_without_a_key_cannot_lease_it(scene: Scene) -> None:
