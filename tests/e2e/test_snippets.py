@@ -16,18 +16,22 @@ import pytest
 
 from splatbot.bench.tabletop import tabletop
 from splatbot.cli import main
+from splatbot.collision import RobotSpheres
 from splatbot.frame import PosePrior
 from splatbot.gaussians import GaussianModel
 from splatbot.grasping.affordance import NameHint, find_target
 from splatbot.grasping.language import LanguageAffordance
 from splatbot.grasping.pick import Picker
 from splatbot.grasping.sampler import GraspSampler
+from splatbot.planning import certify_motion, time_path
 from splatbot.robots.controllers import FakeController
 from splatbot.robots.grippers import FakeGripper
 from splatbot.robots.panda import panda
 from splatbot.segmentation import segment
 from splatbot.serving import serving
+from tests.fake_ros_arm import FakeRosArm
 from tests.unit.grasping.objects import CAN, OBJECTS, colored
+from tests.unit.planning.test_timing import path_of
 
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = ["README.md", *(str(p.relative_to(ROOT)) for p in sorted((ROOT / "docs" / "guide").glob("*.md")))]
@@ -105,9 +109,10 @@ RESULTS: dict[str, Callable[[Names], bool]] = {
     "docs/guide/twin.md": lambda names: names["result"].steps > 1000,
 }
 OF_A_SERVICE = ["docs/guide/robot-in-view.md", "docs/guide/ros.md", "docs/guide/service.md"]
+OF_AN_ARM = "docs/guide/arms.md"
 
 
-@pytest.mark.parametrize("name", [name for name in WITH_SNIPPETS if name not in OF_A_SERVICE])
+@pytest.mark.parametrize("name", [name for name in WITH_SNIPPETS if name not in (*OF_A_SERVICE, OF_AN_ARM)])
 def test_the_snippets_of_a_document_run_in_turn(name: str, desk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(desk)
     names = CONTEXTS.get(name, lambda _: {})(desk)
@@ -121,6 +126,17 @@ def served(desk: Path) -> Iterator[str]:
     """Address of a service of the map."""
     with serving("--map", str(desk / "runs" / "desk"), log=desk / "log.txt") as service:
         yield service.url
+
+
+def test_the_snippet_of_an_arm_moves_one_behind_rosbridge() -> None:
+    (code,) = snippets(OF_AN_ARM)
+    robot = panda()
+    trajectory = time_path(path_of(np.stack([robot.home, robot.home + 0.1])), RobotSpheres(robot), None)
+    names: Names = {"motion": certify_motion(trajectory.slowed(10.0), RobotSpheres(robot, margin=1e-3), None)}
+    with FakeRosArm(robot.chain.names, robot.home) as arm:
+        exec(compile(code.replace("ws://robot:9090", arm.address), OF_AN_ARM, "exec"), names)
+        names["controller"].close()
+        assert np.abs(arm.position - robot.home - 0.1).max() < 5e-3
 
 
 @pytest.mark.parametrize("name", OF_A_SERVICE)
