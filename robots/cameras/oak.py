@@ -224,6 +224,8 @@ def device_streams(pipeline: Any, options: StreamOptions) -> tuple[Any, Any]:
 
 def _depthai() -> Any:
     os.environ.setdefault("DEPTHAI_LEVEL", "error")  # without it, depthai warns of USB in every container
+    # Its signal handler would end the process where a disk is full (SIGXFSZ), which Python ignores.
+    os.environ.setdefault("DEPTHAI_INSTALL_SIGNAL_HANDLER", "0")
     try:
         import depthai
     except ImportError as error:

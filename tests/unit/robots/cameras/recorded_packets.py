@@ -10,6 +10,7 @@ from datetime import timedelta
 from typing import Any
 
 os.environ.setdefault("DEPTHAI_LEVEL", "error")
+os.environ.setdefault("DEPTHAI_INSTALL_SIGNAL_HANDLER", "0")
 
 import depthai as dai
 import numpy as np

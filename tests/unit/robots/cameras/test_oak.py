@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import time
 from itertools import islice
 
@@ -114,6 +117,17 @@ def test_a_closed_camera_ends(make_log: MakeLog) -> None:
         camera.close()
     assert len(frames) == 1
     assert not list(camera)
+
+
+def test_a_driver_leaves_the_signals_of_the_process_alone() -> None:
+    code = (
+        "from splatbot.robots.cameras.oak import _depthai; _depthai(); import resource, signal, tempfile;"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000)); f = tempfile.TemporaryFile(buffering=0)\n"
+        "try:\n    [f.write(bytes(999)) for _ in range(3)]\nexcept OSError:\n    print('full')"
+    )
+    plain = {name: value for name, value in os.environ.items() if not name.startswith("DEPTHAI_")}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, env=plain)
+    assert (done.returncode, done.stdout) == (0, "full\n"), done.stderr[-500:]
 
 
 def test_without_a_device_one_sentence_names_the_fix() -> None:
