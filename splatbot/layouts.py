@@ -21,6 +21,9 @@ LogKind = Literal[
     "realsense",
 ]
 
+REPLAY, OAK, REALSENSE = "replay:", "oak://", "realsense://"
+"""Beginnings of the addresses of cameras, which splatbot.robots.cameras opens."""
+
 MAP_NAME = "map.ply"
 RECORDING = "recording.mcap"
 TRAINING_NAME = "training.json"
@@ -33,7 +36,7 @@ _LAYOUTS_HINT = (
     "color/ with depth/ (Open3D, ScanNet), meta/info.json (LeRobot). Known files: .mcap, .bag, .sens, .r3d, "
     ".db3 (RealSense); `synthetic:tabletop` needs no files"
 )
-_REALSENSE = b"/device_0/sensor_"  # beginning of the topics of librealsense
+_LIBREALSENSE = b"/device_0/sensor_"  # beginning of the topics of librealsense
 _FILES: dict[str, LogKind] = {".mcap": "bag", ".bag": "bag", ".sens": "scannet", ".r3d": "record3d"}
 _WITH_OPTIONS = ("bag", "lerobot", "tum")  # kinds whose path may be followed by ?KEY=VALUE&KEY=VALUE
 _HEAD = 2**20  # bytes of a JSON file that hold its description, or its first frames
@@ -81,6 +84,11 @@ _FOREIGN_MAPS = {
 }
 
 
+def is_camera(uri: str) -> bool:
+    """Return whether a URI names a camera, not a recording."""
+    return uri.startswith((REPLAY, OAK, REALSENSE))
+
+
 def log_kind(uri: str | Path) -> LogKind:
     """Return the kind of a recording by the names of its files.
 
@@ -107,7 +115,7 @@ def _kind(path: Path) -> LogKind | None:
     """Return the kind of the recording at a path by its names, or None."""
     if not path.is_dir():
         suffix = path.suffix.lower()
-        if suffix in (".bag", ".db3") and _names(path, _REALSENSE):
+        if suffix in (".bag", ".db3") and _names(path, _LIBREALSENSE):
             return "realsense"
         return _FILES.get(suffix) if path.exists() else None
     if (path / "metadata.yaml").exists():

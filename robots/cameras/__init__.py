@@ -3,20 +3,13 @@
 from __future__ import annotations
 
 from splatbot.errors import InputError
+from splatbot.layouts import OAK, REALSENSE, REPLAY
 from splatbot.protocols import FrameSource
-from splatbot.robots.cameras import oak, realsense, replay
 from splatbot.robots.cameras.oak import OakCamera
 from splatbot.robots.cameras.realsense import RealsenseCamera
-from splatbot.robots.cameras.replay import PREFIX, ReplayCamera
+from splatbot.robots.cameras.replay import ReplayCamera
 
-__all__ = ["PREFIX", "OakCamera", "RealsenseCamera", "ReplayCamera", "is_camera", "open_camera"]
-
-_PREFIXES = (replay.PREFIX, oak.PREFIX, realsense.PREFIX)
-
-
-def is_camera(uri: str) -> bool:
-    """Return whether a URI names a camera, not a preset or a file."""
-    return uri.startswith(_PREFIXES)
+__all__ = ["OakCamera", "RealsenseCamera", "ReplayCamera", "open_camera"]
 
 
 def open_camera(uri: str, *, joint_delay: float = 0.0) -> FrameSource:
@@ -29,11 +22,11 @@ def open_camera(uri: str, *, joint_delay: float = 0.0) -> FrameSource:
     Raises:
         InputError: the kind of camera is unknown, or an option is invalid.
     """
-    if uri.startswith(replay.PREFIX):
+    if uri.startswith(REPLAY):
         return ReplayCamera.from_uri(uri, joint_delay=joint_delay)
-    if uri.startswith(oak.PREFIX):
+    if uri.startswith(OAK):
         return OakCamera.from_uri(uri)
-    if uri.startswith(realsense.PREFIX):
+    if uri.startswith(REALSENSE):
         return RealsenseCamera.from_uri(uri)
-    hint = f"name one as in {oak.PREFIX}, {realsense.PREFIX} or {replay.PREFIX}recordings/desk"
+    hint = f"name one as in {OAK}, {REALSENSE} or {REPLAY}recordings/desk"
     raise InputError(f"{uri!r} is unknown.", field="camera", hint=hint)

@@ -7,7 +7,6 @@ them. The host part also runs without a device, on two host nodes that send reco
 from __future__ import annotations
 
 import os
-import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -18,12 +17,13 @@ import cv2
 import numpy as np
 
 from splatbot.camera import Camera
-from splatbot.errors import CameraError, DeviceError
+from splatbot.errors import DeviceError
 from splatbot.frame import Frame
-from splatbot.logs.undistort import Undistorter
+from splatbot.layouts import OAK as PREFIX
+from splatbot.robots.cameras.device import CONSTANTS as DEVICE
+from splatbot.robots.cameras.device import RgbdDevice
 from splatbot.robots.cameras.stream_options import StreamOptions, parse_address
 
-PREFIX = "oak://"
 DEFAULT = StreamOptions(width=640, height=400)
 
 MakeStreams = Callable[[Any, StreamOptions], tuple[Any, Any]]
@@ -36,28 +36,21 @@ class OakConstants:
 
     Args:
         queue: pairs that wait for a slow reader; older ones are dropped.
-        silence_s: [s] time without a frame after which the device counts as gone.
-        poll_s: [s] time between two looks at whether the camera was closed.
         millimetres: [units/m] of depth.
     """
 
     queue: int = 4
-    silence_s: float = 10.0
-    poll_s: float = 0.2
     millimetres: float = 1000.0
 
 
 CONSTANTS = OakConstants()
 
 
-class OakCamera:
+class OakCamera(RgbdDevice):
     """An OAK camera as a source of frames; each iteration opens the device.
 
     Stamps are Unix time in the middle of the exposure of colour. The library synchronizes the device's clock to the
     host's monotonic clock. The difference of that to Unix time is measured once, when the device is opened.
-
-    Attributes:
-        dropped: frames of colour without a pair here: a slow reader or the transfer lost them.
 
     Args:
         serial: id, IP address or USB path of the device; empty takes the first one.
@@ -71,13 +64,8 @@ class OakCamera:
     def __init__(
         self, serial: str = "", options: StreamOptions = DEFAULT, *, streams: MakeStreams | None = None
     ) -> None:
-        self.name = "oak" + (f"-{serial}" if serial else "")
-        self.uri = PREFIX + serial
-        self.options = options
-        self.dropped = 0
-        self._serial, self._streams = serial, streams
-        self._closed = threading.Event()
-        self._number = 0
+        super().__init__(PREFIX, serial, options)
+        self._streams = streams
 
     @classmethod
     def from_uri(cls, uri: str) -> OakCamera:
@@ -87,10 +75,6 @@ class OakCamera:
             InputError: an option is unknown or out of range.
         """
         return cls(*parse_address(uri, PREFIX, DEFAULT))
-
-    def close(self) -> None:
-        """End the stream."""
-        self._closed.set()
 
     def __iter__(self) -> Iterator[Frame]:
         dai = _depthai()
@@ -103,17 +87,21 @@ class OakCamera:
         sync.setSyncThreshold(timedelta(seconds=0.5 / self.options.fps))
         color.link(sync.inputs["color"])
         depth.link(sync.inputs["depth"])
-        pairs = sync.out.createOutputQueue(maxSize=CONSTANTS.queue, blocking=False)
+        queue = sync.out.createOutputQueue(maxSize=CONSTANTS.queue, blocking=False)
         unix = time.time() - dai.Clock.now().total_seconds()
+
+        def wait() -> Any:
+            if not pipeline.isRunning():
+                raise RuntimeError("its connection ended")
+            try:
+                return queue.get(timedelta(seconds=DEVICE.poll_s))
+            except dai.MessageQueue.QueueException as error:
+                raise RuntimeError(str(error)) from error
+
         pipeline.start()
         try:
-            last: int | None = None
-            for pair in self._pairs(dai, pipeline, pairs):
-                sequence = pair["color"].getSequenceNum()
-                self.dropped += max(sequence - last - 1, 0) if last is not None else 0
-                last = sequence
+            for pair in self._pairs(wait, lambda pair: pair["color"].getSequenceNum()):
                 yield self._frame(dai, pair["color"], pair["depth"], unix)
-                self._number += 1
         finally:
             pipeline.stop()
             pipeline.wait()
@@ -126,30 +114,7 @@ class OakCamera:
                 "plug it into a USB 3 port, or give its IP address as in oak://192.168.1.44. On Linux, a udev rule for "
                 "vendor 03e7 gives access"
             )
-            raise DeviceError(f"cannot be opened ({error}).", file=self.uri, field="camera", hint=hint) from error
-
-    def _pairs(self, dai: Any, pipeline: Any, pairs: Any) -> Iterator[Any]:
-        """Yield synchronized messages until the camera is closed.
-
-        Raises:
-            DeviceError: the device is gone or silent.
-        """
-        heard = time.monotonic()
-        while not self._closed.is_set():
-            try:
-                pair = pairs.get(timedelta(seconds=CONSTANTS.poll_s)) if pipeline.isRunning() else None
-            except (dai.MessageQueue.QueueException, RuntimeError) as error:
-                raise self._gone(str(error)) from error
-            if pair is not None:
-                heard = time.monotonic()
-                yield pair
-            elif not pipeline.isRunning():
-                raise self._gone("its connection ended")
-            elif time.monotonic() - heard > CONSTANTS.silence_s:
-                raise self._gone(f"no pair of colour and depth for {CONSTANTS.silence_s:g} s")
-
-    def _gone(self, reason: str) -> DeviceError:
-        return DeviceError(f"is gone ({reason}).", file=self.uri, field="camera", hint="check its cable and power")
+            raise self._cannot_be_opened(error, hint) from error
 
     def _frame(self, dai: Any, color: Any, depth: Any, unix: float) -> Frame:
         """Convert a pair of messages.
@@ -162,42 +127,21 @@ class OakCamera:
         bgr, units = color.getCvFrame(), depth.getFrame()
         if bgr.ndim != 3 or bgr.shape[:2] != units.shape:
             raise self._wrong(f"colour is {bgr.shape}, depth is {units.shape} (rows, columns)")
-        rgb = cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
+        rgb = cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
         metres = units.astype(np.float32) / np.float32(CONSTANTS.millimetres)
-        camera = self._camera(dai, color)
-        if camera.distortion:
-            undistorter = Undistorter(camera)
-            rgb, metres, camera = undistorter.color(rgb), undistorter.depth(metres), undistorter.camera
         middle = dai.CameraExposureOffset.MIDDLE
         at, depth_at = (image.getTimestamp(middle).total_seconds() for image in (color, depth))
-        return Frame(
-            stamp=unix + at,
-            rgb=rgb,
-            depth=metres,
-            camera=camera,
-            index=self._number,
-            source=f"{self.uri} frame {self._number}",
-            depth_delay=depth_at - at,
-        )
+        return self._next_frame(unix + at, rgb, metres, self._factory_camera(dai, color), depth_at - at)
 
-    def _camera(self, dai: Any, color: Any) -> Camera:
+    def _factory_camera(self, dai: Any, color: Any) -> Camera:
         """Return the factory calibration of an image, which depthai scales and crops with it."""
         image = color.getTransformation()
         K = np.array(image.getIntrinsicMatrix(), dtype=np.float64)
         lens = tuple(float(value) for value in image.getDistortionCoefficients())
         if any(lens) and (image.getDistortionModel() != dai.CameraModel.Perspective or any(lens[8:])):
             raise self._wrong(f"colour has the lens model {image.getDistortionModel().name} {lens}")
-        try:
-            fx, fy, cx, cy = (float(K[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
-            camera = Camera(fx, fy, cx, cy, color.getWidth(), color.getHeight(), lens[:8] if any(lens) else ())
-            camera.check_plausible()
-            return camera
-        except CameraError as error:
-            raise self._wrong(f"{error.field} {error.message.rstrip('.')}") from error
-
-    def _wrong(self, reason: str) -> DeviceError:
-        hint = "update the firmware and depthai, or check the device with Luxonis' oak-viewer"
-        return DeviceError(f"delivers unexpected images: {reason}.", file=self.uri, field="camera", hint=hint)
+        size = (color.getWidth(), color.getHeight())
+        return self._camera(K[0, 0], K[1, 1], K[0, 2], K[1, 2], size=size, distortion=lens[:8])
 
 
 def device_streams(pipeline: Any, options: StreamOptions) -> tuple[Any, Any]:

@@ -2,39 +2,21 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from splatbot.camera import Camera
-from splatbot.errors import CameraError, DeviceError
+from splatbot.errors import DeviceError
 from splatbot.frame import Frame
-from splatbot.logs.undistort import Undistorter
+from splatbot.layouts import REALSENSE as PREFIX
+from splatbot.robots.cameras.device import CONSTANTS as DEVICE
+from splatbot.robots.cameras.device import RgbdDevice
 from splatbot.robots.cameras.stream_options import StreamOptions, parse_address
 
-PREFIX = "realsense://"
 DEFAULT = StreamOptions(width=640, height=480)
-
-
-@dataclass(frozen=True)
-class RealsenseConstants:
-    """Constants of the RealSense driver.
-
-    Args:
-        silence_s: [s] time without a pair after which the device counts as gone.
-        poll_ms: [ms] time between two looks at whether the camera was closed.
-    """
-
-    silence_s: float = 10.0
-    poll_ms: int = 200
-
-
-CONSTANTS = RealsenseConstants()
 
 
 class FrameSets(Protocol):
@@ -56,14 +38,11 @@ Raises RuntimeError as librealsense does: no device, or no such streams.
 """
 
 
-class RealsenseCamera:
+class RealsenseCamera(RgbdDevice):
     """A RealSense camera as a source of frames; each iteration opens the device.
 
     Stamps of librealsense in global or system time are Unix time. Those of the device's own clock are shifted to Unix
     time by the first image.
-
-    Attributes:
-        dropped: images of colour without a pair here: a slow reader or the transfer lost them.
 
     Args:
         serial: serial number; empty takes the first device.
@@ -77,13 +56,8 @@ class RealsenseCamera:
     def __init__(
         self, serial: str = "", options: StreamOptions = DEFAULT, *, open_streams: OpenStreams | None = None
     ) -> None:
-        self.name = "realsense" + (f"-{serial}" if serial else "")
-        self.uri = PREFIX + serial
-        self.options = options
-        self.dropped = 0
-        self._serial, self._open = serial, open_streams or DeviceStreams
-        self._closed = threading.Event()
-        self._number = 0
+        super().__init__(PREFIX, serial, options)
+        self._open = open_streams or DeviceStreams
 
     @classmethod
     def from_uri(cls, uri: str) -> RealsenseCamera:
@@ -94,10 +68,6 @@ class RealsenseCamera:
         """
         return cls(*parse_address(uri, PREFIX, DEFAULT))
 
-    def close(self) -> None:
-        """End the stream."""
-        self._closed.set()
-
     def __iter__(self) -> Iterator[Frame]:
         rs = _pyrealsense()
         if self._closed.is_set():
@@ -106,57 +76,36 @@ class RealsenseCamera:
             streams = self._open(self._serial, self.options)
         except RuntimeError as error:
             hint = "plug it into a USB 3 port; `rs-enumerate-devices` lists its sizes and rates, and its serial number"
-            raise DeviceError(f"cannot be opened ({error}).", file=self.uri, field="camera", hint=hint) from error
+            raise self._cannot_be_opened(error, hint) from error
         try:
             align = rs.align(rs.stream.color)
-            last: int | None = None
             shift: float | None = None
-            lens: _Lens | None = None
-            for pair in self._pairs(streams):
+            poll_ms = round(1e3 * DEVICE.poll_s)
+            for pair in self._pairs(lambda: streams.wait(poll_ms), _number_of):
                 aligned = align.process(pair)
                 color, depth = aligned.get_color_frame(), aligned.get_depth_frame()
-                self.dropped += max(color.get_frame_number() - last - 1, 0) if last is not None else 0
-                last = color.get_frame_number()
+                at, depth_at = (1e-3 * image.get_timestamp() for image in (color, depth))
+                clock, depth_clock = (image.get_frame_timestamp_domain() for image in (color, depth))
                 if shift is None:
-                    own = color.get_frame_timestamp_domain() == rs.timestamp_domain.hardware_clock
-                    shift = time.time() - 1e-3 * color.get_timestamp() if own else 0.0
-                lens = lens or _Lens(rs, color.profile.as_video_stream_profile().intrinsics, self.uri)
-                stamp = 1e-3 * color.get_timestamp()
-                one_clock = color.get_frame_timestamp_domain() == depth.get_frame_timestamp_domain()
+                    shift = time.time() - at if clock == rs.timestamp_domain.hardware_clock else 0.0
+                rgb = np.array(color.get_data())  # a copy: the buffer belongs to librealsense
                 metres = np.asanyarray(depth.get_data()).astype(np.float32) * np.float32(depth.get_units())
-                yield Frame(
-                    stamp=shift + stamp,
-                    rgb=lens.color(np.asanyarray(color.get_data())),
-                    depth=lens.depth(metres),
-                    camera=lens.camera,
-                    index=self._number,
-                    source=f"{self.uri} frame {self._number}",
-                    depth_delay=1e-3 * depth.get_timestamp() - stamp if one_clock else 0.0,
-                )
-                self._number += 1
+                delay = depth_at - at if clock == depth_clock else 0.0
+                yield self._next_frame(shift + at, rgb, metres, self._color_camera(rs, color), delay)
         finally:
             streams.stop()
 
-    def _pairs(self, streams: FrameSets) -> Iterator[Any]:
-        """Yield sets with colour and depth until the camera is closed.
+    def _color_camera(self, rs: Any, color: Any) -> Camera:
+        """Return the camera of colour.
 
-        Raises:
-            DeviceError: the device is gone or silent.
+        "Brown-Conrady" is OpenCV's lens model. "Inverse Brown-Conrady" of librealsense 2.5x projects as OpenCV's does,
+        but for a radial factor in the tangential terms. They are 1e-3 px apart with the lenses of these cameras.
         """
-        heard = time.monotonic()
-        while not self._closed.is_set():
-            try:
-                pair = streams.wait(CONSTANTS.poll_ms)
-            except RuntimeError as error:
-                raise self._gone(str(error)) from error
-            if pair is not None:
-                heard = time.monotonic()
-                yield pair
-            elif time.monotonic() - heard > CONSTANTS.silence_s:
-                raise self._gone(f"no pair of colour and depth for {CONSTANTS.silence_s:g} s")
-
-    def _gone(self, reason: str) -> DeviceError:
-        return DeviceError(f"is gone ({reason}).", file=self.uri, field="camera", hint="check its cable and power")
+        i = color.profile.as_video_stream_profile().intrinsics
+        if any(i.coeffs) and i.model not in (rs.distortion.inverse_brown_conrady, rs.distortion.brown_conrady):
+            raise self._wrong(f"colour has the lens model {i.model}")
+        size, lens = (i.width, i.height), tuple(float(value) for value in i.coeffs)
+        return self._camera(i.fx, i.fy, i.ppx, i.ppy, size=size, distortion=lens)
 
 
 class DeviceStreams:
@@ -185,35 +134,8 @@ class DeviceStreams:
         self._pipeline.stop()
 
 
-class _Lens:
-    """Images of a RealSense colour camera as those of a pinhole camera with the same intrinsic matrix.
-
-    "Brown-Conrady" is OpenCV's model. "Inverse Brown-Conrady" of librealsense 2.5x projects as OpenCV's does, but for
-    a radial factor in the tangential terms. They are 1e-3 px apart with the lenses of these cameras.
-    """
-
-    def __init__(self, rs: Any, intrinsics: Any, uri: str) -> None:
-        coefficients = tuple(float(value) for value in intrinsics.coeffs) if any(intrinsics.coeffs) else ()
-        if coefficients and intrinsics.model not in (rs.distortion.inverse_brown_conrady, rs.distortion.brown_conrady):
-            hint = "take another size of colour"
-            raise DeviceError(f"has the lens model {intrinsics.model}.", file=uri, field="intrinsics", hint=hint)
-        i = intrinsics
-        try:
-            recorded = Camera(i.fx, i.fy, i.ppx, i.ppy, i.width, i.height, coefficients)
-            recorded.check_plausible()
-        except CameraError as error:
-            reason = f"{error.field} {error.message}"
-            raise DeviceError(reason, file=uri, field="intrinsics", hint="calibrate the camera again") from error
-        self.camera = replace(recorded, distortion=())
-        self._undistorter = Undistorter(recorded) if coefficients else None
-
-    def color(self, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Return colour (H, W, 3) without distortion; the buffer of ``rgb`` belongs to librealsense."""
-        return rgb.copy() if self._undistorter is None else self._undistorter.color(rgb)
-
-    def depth(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return depth (H, W) [m] without distortion, of the nearest pixel."""
-        return depth if self._undistorter is None else self._undistorter.depth(depth)
+def _number_of(pair: Any) -> int:
+    return int(pair.get_color_frame().get_frame_number())
 
 
 def _pyrealsense() -> Any:

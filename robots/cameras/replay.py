@@ -13,9 +13,9 @@ import numpy as np
 from splatbot.camera import Camera
 from splatbot.errors import DeviceError, InputError
 from splatbot.frame import Frame
+from splatbot.layouts import REPLAY as PREFIX
 from splatbot.logs import Log, open_log
 
-PREFIX = "replay:"
 _QUEUE = 4  # frames that a driver buffers for a slow reader, the default of depthai's queues
 _END = object()
 

@@ -27,6 +27,34 @@ class ControllerConstants:
 CONSTANTS = ControllerConstants()
 
 
+def certified(motion: TimedPath, state: MotionState, fault: str) -> CertifiedMotion:
+    """Return a motion that a controller in a state may begin.
+
+    Raises:
+        ControllerError: the motion is not certified, or the arm is at fault or moving.
+    """
+    if not isinstance(motion, CertifiedMotion):
+        hint = "certify it with splatbot.planning.certify_motion"
+        raise ControllerError(f"{type(motion).__name__} is not certified.", field="motion", hint=hint)
+    if state is MotionState.FAULT:
+        raise ControllerError(f"is at fault: {fault}.", field="controller", hint="reset it")
+    if state is MotionState.MOVING:
+        raise ControllerError("is moving.", field="controller", hint="stop it, or wait until it has arrived")
+    return motion
+
+
+def check_start(start: Array, position: Array, tolerance: float) -> None:
+    """Check that a motion begins where the arm is: all joints (J,) within a tolerance [rad or m].
+
+    Raises:
+        ControllerError: it begins elsewhere.
+    """
+    distance = float(np.abs(start - position).max())
+    if not distance <= tolerance:
+        hint = "plan from where the arm is"
+        raise ControllerError(f"begins {distance:.4f} from where the arm is.", field="motion", hint=hint)
+
+
 class SteppedController:
     """A :class:`splatbot.protocols.Controller` whose motion a subclass defines.
 
@@ -74,20 +102,10 @@ class SteppedController:
         Raises:
             ControllerError: the motion is not certified, begins elsewhere, or the arm is at fault or moving.
         """
-        if not isinstance(motion, CertifiedMotion):
-            hint = "certify it with splatbot.planning.certify_motion"
-            raise ControllerError(f"{type(motion).__name__} is not certified.", field="motion", hint=hint)
-        if self._state is MotionState.FAULT:
-            raise ControllerError(f"is at fault: {self._fault}.", field="controller", hint="reset it")
-        if self._state is MotionState.MOVING:
-            raise ControllerError("is moving.", field="controller", hint="stop it, or wait until it has arrived")
-        start = motion.reference(0.0)[0]
+        start = certified(motion, self._state, self._fault).reference(0.0)[0]
         if start.shape != self._position.shape:
             raise ControllerError(f"has {start.size} joints, not {self._position.size}.", field="motion")
-        distance = float(np.abs(start - self._position).max())
-        if not distance <= CONSTANTS.max_start_error:
-            hint = "plan from where the arm is"
-            raise ControllerError(f"begins {distance:.4f} from where the arm is.", field="motion", hint=hint)
+        check_start(start, self._position, CONSTANTS.max_start_error)
         self._motion, self._time, self._stopping = motion, 0.0, False
         self._state = MotionState.MOVING
 

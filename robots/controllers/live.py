@@ -15,6 +15,7 @@ from splatbot.errors import ControllerError, InputError, SplatbotError
 from splatbot.planning.certify import CONSTANTS as CERTIFICATION
 from splatbot.planning.certify import CertifiedMotion, certify_motion
 from splatbot.protocols import Array, Feedback, MotionState, RobotKinematics, TimedPath
+from splatbot.robots.controllers.base import certified, check_start
 from splatbot.robots.controllers.deviation import Deviation, between_set_points
 
 _GRID_S = 0.01  # [s] spacing of the samples of the curve that a measured position is compared with
@@ -116,19 +117,9 @@ class LiveController:
             ControllerError: the executed motion would deviate too far from the certified curve.
             ControllerError: the arm is at fault, moves, or does not report where it is.
         """
-        if not isinstance(motion, CertifiedMotion):
-            hint = "certify it with splatbot.planning.certify_motion"
-            raise ControllerError(f"{type(motion).__name__} is not certified.", field="motion", hint=hint)
-        if self._state is MotionState.FAULT:
-            raise ControllerError(f"is at fault: {self._fault}.", field="controller", hint="reset it")
-        if self._state is MotionState.MOVING:
-            raise ControllerError("is moving.", field="controller", hint="stop it, or wait until it has arrived")
+        motion = certified(motion, self._state, self._fault)
         self._check_motion(motion)
-        start = motion.reference(0.0)[0]
-        distance = float(np.abs(start - self._resting().position).max())
-        if not distance <= self.options.start_tolerance:
-            hint = "plan from where the arm is"
-            raise ControllerError(f"begins {distance:.4f} from where the arm is.", field="motion", hint=hint)
+        check_start(motion.reference(0.0)[0], self._resting().position, self.options.start_tolerance)
         self._curve.clear()
         self._time = self._sampled = 0.0
         self._stopping = False

@@ -7,12 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from splatbot.errors import InputError
+from splatbot.layouts import REPLAY
 
 if TYPE_CHECKING:
     from splatbot.logs.live import RecordedCamera
-
-CAMERA_PREFIXES = ("oak://", "realsense://", "replay:")
-"""Beginnings of the addresses of cameras; splatbot.robots.cameras opens them, which imports libraries."""
 
 
 def refuse_with_camera(given: Mapping[str, object]) -> None:
@@ -46,6 +44,6 @@ def open_recorded(
 
     if seconds is not None and not 0 < seconds < 1e6:
         raise InputError(f"is {seconds}.", field="--seconds", hint="give seconds, above 0")
-    if uri.startswith("replay:") and Path(uri.removeprefix("replay:").partition("?")[0]).resolve() == path.resolve():
+    if uri.startswith(REPLAY) and Path(uri.removeprefix(REPLAY).partition("?")[0]).resolve() == path.resolve():
         raise InputError("is the recording that is replayed.", file=path, field="--out", hint="name another place")
     return RecordedCamera(open_camera(uri), path, max_frames=max_frames, seconds=seconds, overwrite=overwrite)

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import os
+from contextlib import ExitStack
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from splatbot.cli.cameras import CAMERA_PREFIXES, open_recorded, refuse_with_camera
+from splatbot.cli.cameras import open_recorded, refuse_with_camera
 from splatbot.cli.doubts import camera_doubts, run_doubts
 from splatbot.cli.messages import print_message
 from splatbot.cli.paths import check_camera, check_file, check_output, check_state
 from splatbot.errors import InputError
-from splatbot.layouts import MAP_NAME, RECORDING, log_kind
+from splatbot.layouts import MAP_NAME, RECORDING, is_camera, log_kind
 
 if TYPE_CHECKING:
     from splatbot.logs import Log
@@ -98,7 +99,7 @@ def map_log_command(
         hint = "leave --config, --set and --budget-ms out, or map the log again"
         raise InputError("a saved run keeps its configuration.", field="--config, --set, --budget-ms", hint=hint)
     if not dump_config:
-        device = log.startswith(CAMERA_PREFIXES)
+        device = is_camera(log)
         if device:
             refuse_with_camera({"--camera": camera, "--robot": robot, "--resume": resume, "--rate": rate})
         elif seconds is not None:
@@ -126,17 +127,20 @@ def map_log_command(
     if resume is not None and saved is not None:
         log, camera, out = log or saved.place.uri, camera or saved.place.camera, out or resume
         robot = robot or saved.place.robot
+    ends = ExitStack()
     if device:
         folder = out or _new_folder(log.partition("?")[0])
         path = folder / RECORDING
-        recording: Log = open_recorded(log, path, max_frames=max_frames, seconds=seconds, overwrite=overwrite)
+        recorded = open_recorded(log, path, max_frames=max_frames, seconds=seconds, overwrite=overwrite)
+        recording: Log = recorded
+        ends.callback(recorded.close)
     else:
         recording = open_without_robot(log, robot, camera=camera)
         folder = out or _new_folder(recording.name)
     if not quiet:
         for doubt in camera_doubts(recording.camera):
             print_message("question", doubt)
-    with progress_display(quiet=quiet) as on_progress:
+    with ends, progress_display(quiet=quiet) as on_progress:
         result = map_log(
             recording,
             config=settings,
@@ -181,7 +185,7 @@ def _check(
     for saved in (resume, localise):
         if saved is not None:
             check_state(saved)
-    if log and not log.startswith(CAMERA_PREFIXES):
+    if log and not is_camera(log):
         log_kind(log)
     if resume is None or (out is not None and out.resolve() != resume.resolve()):
         check_output(out or Path("runs"))

@@ -8,11 +8,11 @@ from typing import Annotated
 
 import tyro
 
-from splatbot.cli.cameras import CAMERA_PREFIXES, open_recorded, refuse_with_camera
+from splatbot.cli.cameras import open_recorded, refuse_with_camera
 from splatbot.cli.paths import check_camera, check_output
 from splatbot.cli.progress import steps
 from splatbot.errors import InputError
-from splatbot.layouts import log_kind
+from splatbot.layouts import is_camera, log_kind
 
 
 def record(
@@ -45,7 +45,7 @@ def record(
         max_frames: with a camera, end after this number of frames.
         quiet: no progress and no summary, only errors.
     """
-    device = log.startswith(CAMERA_PREFIXES)
+    device = is_camera(log)
     if device:
         refuse_with_camera({"--camera": camera})
     else:

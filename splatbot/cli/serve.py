@@ -12,7 +12,7 @@ import tyro
 
 from splatbot.cli.paths import check_camera, check_file, check_output
 from splatbot.errors import InputError
-from splatbot.layouts import log_kind, map_file
+from splatbot.layouts import REPLAY, is_camera, log_kind, map_file
 
 if TYPE_CHECKING:
     from splatbot.logs import Log
@@ -102,7 +102,7 @@ def serve(
 
     from splatbot.config import load_config
     from splatbot.logs import open_log
-    from splatbot.robots.cameras import PREFIX, is_camera, open_camera
+    from splatbot.robots.cameras import open_camera
     from splatbot.services.requests import configure_logging
     from splatbot.services.runtime import Runtime, check_exposure
     from splatbot.services.server import run_service
@@ -127,14 +127,16 @@ def serve(
         if map is not None:
             _add_map(runtime, map)
         elif device is not None:
-            _follow(runtime, device.removeprefix(PREFIX), lambda delay: open_camera(device, joint_delay=delay))
+            _follow(runtime, device.removeprefix(REPLAY), lambda delay: open_camera(device, joint_delay=delay))
         elif log is not None:
             _follow(runtime, log, lambda delay: open_log(log, camera=camera, joint_delay=delay))
         run_service(runtime, on_start=partial(_announce, settings))
     finally:
-        runtime.close()
-        if controller is not None:
-            controller.close()
+        try:
+            runtime.close()
+        finally:
+            if controller is not None:
+                controller.close()
     return 0
 
 

@@ -35,6 +35,7 @@ from splatbot.logs.ros_frames import (
     mask_of,
     pose_of,
     seconds_of,
+    to_nanoseconds,
 )
 from splatbot.logs.ros_types import Message, typestore
 from splatbot.logs.streams import bag_streams, header_stamp, obstacle_to_mapping
@@ -251,10 +252,11 @@ class BagLog(StampedLog):
         return sorted(first.values(), key=lambda e: e.stamp)
 
     def _pair(self) -> list[tuple[_Entry, _Entry]]:
-        """Pair images that were received at one time, as splatbot writes them; else those nearest by their stamps."""
+        """Pair the images of one frame as splatbot records them, in others those that are nearest by their stamps."""
         colors, depths = self._index[self._color], self._index[self._depth]
         together = {entry.received: entry for entry in depths}
-        if len(together) == len(depths) and all(entry.received in together for entry in colors):
+        own = all(entry.received in together and entry.received == to_nanoseconds(entry.stamp) for entry in colors)
+        if own and len(together) == len(depths):
             return [(entry, together[entry.received]) for entry in colors]
         depths = self._distinct(self._depth, depths)
         a, b = (np.array([entry.stamp for entry in entries]) for entries in (colors, depths))

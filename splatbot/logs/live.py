@@ -86,11 +86,6 @@ class RecordedCamera(LogBase):
         return None
 
     @property
-    def ended(self) -> bool:
-        """Return whether the camera delivers no further frame."""
-        return self._ended
-
-    @property
     def missed(self) -> int:
         """Return the number of frames that the camera lost before they were recorded."""
         return self._camera.dropped

@@ -16,7 +16,7 @@ from splatbot.logs.base import StampedLog
 from splatbot.logs.index import associate
 from splatbot.logs.realsense_files import BagFile, Images, RealSenseFile, SqliteFile
 from splatbot.logs.registration import ColorRegistration
-from splatbot.logs.ros_frames import color_of, depth_of
+from splatbot.logs.ros_frames import camera_of, color_of, depth_of
 from splatbot.logs.undistort import Undistorter
 from splatbot.protocols import Array
 
@@ -114,13 +114,10 @@ class RealSenseLog(StampedLog):
 
     def _camera_of(self, stream: str) -> Camera:
         info = self._file.camera_info(stream)
-        k, d = (np.asarray(getattr(info, a, getattr(info, a.upper(), None)), np.float64) for a in ("k", "d"))
-        if d.any() and info.distortion_model not in _MODELS:
-            raise self._bad(f"{stream} lens", f"is {info.distortion_model!r}", "record another size of this stream")
+        if info.distortion_model in _MODELS:
+            info.distortion_model = "plumb_bob"  # OpenCV's five coefficients
         try:
-            lens = tuple(d[:5].tolist()) if d.any() else ()
-            fx, fy, cx, cy = k[[0, 4, 2, 5]].tolist()
-            camera = Camera(fx, fy, cx, cy, int(info.width), int(info.height), lens)
+            camera = camera_of(info)
             camera.check_plausible()
         except CameraError as error:
             field = f"{stream} {error.field}"

@@ -135,7 +135,6 @@ def test_the_snippet_of_an_arm_moves_one_behind_rosbridge() -> None:
     names: Names = {"motion": certify_motion(trajectory.slowed(10.0), RobotSpheres(robot, margin=1e-3), None)}
     with FakeRosArm(robot.chain.names, robot.home) as arm:
         exec(compile(code.replace("ws://robot:9090", arm.address), OF_AN_ARM, "exec"), names)
-        names["controller"].close()
         assert np.abs(arm.position - robot.home - 0.1).max() < 5e-3
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from splatbot.errors import DeviceError, InputError
 from splatbot.frame import Frame
 from splatbot.logs import open_log
-from splatbot.robots.cameras import OakCamera, oak, open_camera
+from splatbot.robots.cameras import OakCamera, device, open_camera
 from splatbot.robots.cameras.stream_options import StreamOptions
 from tests.conftest import MakeLog
 from tests.unit.robots.cameras.recorded_packets import PERIOD_S, Packet, RecordedStreams, dai
@@ -99,7 +99,7 @@ def test_images_of_another_kind_are_refused_by_name(
 def test_a_silent_device_is_gone_and_lost_images_are_counted(
     make_log: MakeLog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(oak, "CONSTANTS", oak.OakConstants(silence_s=0.5))
+    monkeypatch.setattr(device, "CONSTANTS", device.RgbdDeviceConstants(silence_s=0.5))
     streams = packets(list(open_log(make_log(6))))
     for part in ("_color", "_depth"):
         setattr(streams, part, [p for p in getattr(streams, part) if p.sequence not in (2, 3)])

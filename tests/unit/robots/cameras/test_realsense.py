@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from splatbot.errors import DeviceError, InputError
 from splatbot.frame import Frame
-from splatbot.robots.cameras import RealsenseCamera, open_camera, realsense
+from splatbot.robots.cameras import RealsenseCamera, device, open_camera
 from splatbot.robots.cameras.stream_options import StreamOptions
 
 rs = pytest.importorskip("pyrealsense2", reason="pyrealsense2 (extra realsense) is not installed")
@@ -172,7 +172,7 @@ def test_a_distorted_lens_is_undone_as_librealsense_defines_it() -> None:
 
 
 def test_lost_images_are_counted_and_a_silent_device_is_gone(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(realsense, "CONSTANTS", realsense.RealsenseConstants(silence_s=0.5, poll_ms=50))
+    monkeypatch.setattr(device, "CONSTANTS", device.RgbdDeviceConstants(silence_s=0.5))
     camera = opened(lambda: SoftwareStreams(scene(8), missing=(4, 5)))
     with pytest.raises(DeviceError, match="is gone"):
         list(camera)
