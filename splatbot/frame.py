@@ -67,6 +67,7 @@ class Frame:
         depth_delay: time [s] by which the depth image is later than ``stamp``, by the stamps of a sensor whose streams
             are not synchronized.
         joint_names: names of ``joints``. If empty, they are in the order of the robot.
+        camera_name: name of the camera where several cameras map; empty for the first one.
 
     Raises:
         InputError: sizes differ, a type is wrong or depth is negative.
@@ -83,6 +84,7 @@ class Frame:
     source: str = field(default="", compare=False)
     depth_delay: float = 0.0
     joint_names: tuple[str, ...] = ()
+    camera_name: str = ""
 
     def __post_init__(self) -> None:
         where = self.source or f"frame {self.index}"

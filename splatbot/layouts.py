@@ -19,6 +19,7 @@ LogKind = Literal[
     "record3d",
     "lerobot",
     "realsense",
+    "rig",
 ]
 
 REPLAY, OAK, REALSENSE = "replay:", "oak://", "realsense://"
@@ -34,7 +35,7 @@ _SOG_NAME = "meta.json"  # of a map in a folder of WebP images
 _LAYOUTS_HINT = (
     "known folders: rgb.txt with depth.txt (TUM), results/ with traj.txt (Replica), metadata.yaml (ROS 2), 7-Scenes, "
     "color/ with depth/ (Open3D, ScanNet), meta/info.json (LeRobot). Known files: .mcap, .bag, .sens, .r3d, "
-    ".db3 (RealSense); `synthetic:tabletop` needs no files"
+    ".db3 (RealSense), .yaml (several cameras); `synthetic:tabletop` needs no files"
 )
 _LIBREALSENSE = b"/device_0/sensor_"  # beginning of the topics of librealsense
 _FILES: dict[str, LogKind] = {".mcap": "bag", ".bag": "bag", ".sens": "scannet", ".r3d": "record3d"}
@@ -117,6 +118,8 @@ def _kind(path: Path) -> LogKind | None:
         suffix = path.suffix.lower()
         if suffix in (".bag", ".db3") and _names(path, _LIBREALSENSE):
             return "realsense"
+        if suffix in (".yaml", ".yml") and _names(path, b"cameras:"):
+            return "rig"
         return _FILES.get(suffix) if path.exists() else None
     if (path / "metadata.yaml").exists():
         return "bag"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_serializer, model_validator
@@ -288,6 +289,57 @@ class BundleConfig(_Section):
     min_rotation: float = Field(default=0.001, gt=0, description="smaller corrections do not move the map [rad]")
 
 
+class PoseConfig(_Section):
+    """A rigid transform: translation [m] and unit quaternion (w, x, y, z), normalized here."""
+
+    translation: tuple[float, float, float]
+    quaternion_wxyz: tuple[float, float, float, float]
+
+    @model_validator(mode="after")
+    def _normalize(self) -> PoseConfig:
+        values = (*self.translation, *self.quaternion_wxyz)
+        norm = math.hypot(*self.quaternion_wxyz)
+        if not all(math.isfinite(value) for value in values) or not 0.5 < norm < 2.0:
+            raise ValueError("it needs finite numbers and a quaternion of length 1, as 1 0 0 0")
+        w, x, y, z = self.quaternion_wxyz
+        self.__dict__["quaternion_wxyz"] = (w / norm, x / norm, y / norm, z / norm)
+        return self
+
+
+class CameraConfig(_Section):
+    """A further camera of the map, next to the first one that defines the world.
+
+    ``T_world_camera`` makes it a fixed camera, ``T_first_camera`` one that is carried by the first camera. With neither
+    of them it is free: it is tracked on its own. The pose is exact if both standard deviations are 0. Otherwise it is
+    the start of an estimate against the map.
+    """
+
+    T_world_camera: PoseConfig | None = Field(
+        default=None, description="pose of a fixed camera; the world is the first camera in its first frame"
+    )
+    T_first_camera: PoseConfig | None = Field(
+        default=None, description="pose in the frame of the first camera that carries it"
+    )
+    translation_sigma: float = Field(
+        default=0.0, ge=0, le=0.2, description="standard deviation of the pose's translation along each axis [m]"
+    )
+    rotation_sigma: float = Field(
+        default=0.0, ge=0, le=0.35, description="standard deviation of the pose's rotation about each axis [rad]"
+    )
+    sensor: SensorConfig = Field(default_factory=SensorConfig)
+
+    @model_validator(mode="after")
+    def _one_pose(self) -> CameraConfig:
+        if self.T_world_camera is not None and self.T_first_camera is not None:
+            raise ValueError("give T_world_camera or T_first_camera, not both")
+        has_sigma = self.translation_sigma > 0 or self.rotation_sigma > 0
+        if has_sigma and self.T_world_camera is None and self.T_first_camera is None:
+            raise ValueError("a standard deviation needs a pose: T_world_camera or T_first_camera")
+        if (self.translation_sigma > 0) != (self.rotation_sigma > 0):
+            raise ValueError("give both standard deviations, or none for an exact pose")
+        return self
+
+
 class Config(_Section):
     """All settings of a run.
 
@@ -299,6 +351,7 @@ class Config(_Section):
     mapping: MappingConfig = Field(default_factory=lambda: MappingConfig())
     loops: LoopsConfig = Field(default_factory=LoopsConfig)
     bundle: BundleConfig = Field(default_factory=BundleConfig)
+    cameras: dict[str, CameraConfig] = Field(default_factory=dict, description="further cameras by name")
     seed: int = Field(default=0, description="seed of every random choice")
 
     @model_validator(mode="after")
@@ -307,6 +360,19 @@ class Config(_Section):
             self.__dict__["tracking"] = self.tracking.model_copy()
             self.tracking.__dict__["sensor"] = self.sensor
         return self
+
+    def of_camera(self, name: str) -> Config:
+        """Return the configuration of a camera: that of the run with the camera's own sensor.
+
+        Args:
+            name: of a further camera; empty for the first one.
+        """
+        if not name:
+            return self
+        sensor = self.cameras[name].sensor
+        tracking = self.tracking.model_copy()
+        tracking.__dict__["sensor"] = sensor
+        return self.model_copy(update={"sensor": sensor, "tracking": tracking})
 
     def to_yaml(self) -> str:
         """Return the configuration in force as YAML that :func:`splatbot.config.load_config` reads back."""

@@ -14,6 +14,7 @@ from splatbot.logs.image_folder import ImageFolderLog
 from splatbot.logs.record import record
 from splatbot.logs.record3d import Record3dLog
 from splatbot.logs.replica import ReplicaLog
+from splatbot.logs.rig import RigLog
 from splatbot.logs.scannet import ScanNetLog
 from splatbot.logs.seven_scenes import SevenScenesLog
 from splatbot.logs.transforms import TransformsLog
@@ -41,7 +42,7 @@ def open_log(
     Args:
         uri: a folder in TUM, Replica, 7-Scenes, Open3D, ScanNet or Nerfstudio layout, or a `.sens` or `.r3d` file. A
             recording of RealSense is a `.db3` or `.bag`. A recording of ROS topics is an `.mcap`, a rosbag2 folder or a
-            `.bag`. Select one of several cameras by
+            `.bag`. A `.yaml` file lists several cameras (:mod:`splatbot.logs.rig`). Select one of several cameras by
             `FILE?color=TOPIC&depth=TOPIC&info=TOPIC`. In a LeRobot dataset, `FOLDER?episode=N&color=KEY&depth=KEY`
             selects an episode and a camera. In TUM folders and recordings of ROS topics, `?pair_within=0.05` is the
             largest difference [s] of the stamps of colour and depth, 0.02 by default. Generated logs have the form
@@ -56,6 +57,11 @@ def open_log(
         CameraError: there are no usable intrinsics.
     """
     kind = log_kind(uri)
+    if kind == "rig":
+        if camera is not None:
+            hint = "write `camera: FILE` to each camera of the file"
+            raise LogError("each camera has its own.", file=uri, field="camera", hint=hint)
+        return RigLog(uri, lambda address, own: open_log(address, camera=own, missing=missing, joint_delay=joint_delay))
     if kind in _OWN_CAMERAS:
         if camera is not None:
             raise LogError("the log has its own camera.", file=uri, field="camera", hint="leave --camera out")

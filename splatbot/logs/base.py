@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, Protocol, cast
 
 from splatbot.camera import Camera
+from splatbot.config import CameraConfig
 from splatbot.frame import Frame
 from splatbot.logs.calibration import Calibration
 from splatbot.trajectory import Trajectory
@@ -54,6 +55,11 @@ class Log(Protocol):
         """Calibration of the recorded images, with the sensor's values of the configuration if they are known."""
         ...
 
+    @property
+    def cameras(self) -> Mapping[str, CameraConfig]:
+        """Further cameras by their name, whose frames have it as ``camera_name``; empty for a single camera."""
+        ...
+
     def __len__(self) -> int: ...
 
     def __iter__(self) -> Iterator[Frame]: ...
@@ -82,6 +88,11 @@ class LogBase:
     def calibration(self) -> Calibration:
         """The camera of the delivered frames, and millimetres; see :class:`Log`."""
         return Calibration(cast(Log, self).camera, MILLIMETRES)
+
+    @property
+    def cameras(self) -> Mapping[str, CameraConfig]:
+        """No further cameras; see :class:`Log`."""
+        return {}
 
     def __len__(self) -> int:
         raise NotImplementedError
@@ -140,6 +151,11 @@ class DerivedLog(LogBase):
     def calibration(self) -> Calibration:
         """As of the other log."""
         return self._log.calibration
+
+    @property
+    def cameras(self) -> Mapping[str, CameraConfig]:
+        """As of the other log."""
+        return self._log.cameras
 
     def __len__(self) -> int:
         return len(self._log)

@@ -9,6 +9,7 @@ import numpy as np
 
 from splatbot.errors import CameraError, LogError
 from splatbot.frame import Frame
+from splatbot.logs.base import StampedLog
 from splatbot.logs.calibration import Calibration, make_calibration, read_object
 from splatbot.logs.presets import find_calibration
 from splatbot.logs.rgbd import FolderLog, RgbdReader
@@ -17,7 +18,7 @@ from splatbot.trajectory import Trajectory
 _RATE = 30.0  # [Hz]; the layout has no stamps
 
 
-class ReplicaLog(FolderLog):
+class ReplicaLog(FolderLog, StampedLog):
     """A rendered sequence; frame i has the stamp i / 30 s and the pose of line i of traj.txt.
 
     Raises:
@@ -33,6 +34,7 @@ class ReplicaLog(FolderLog):
             raise LogError(
                 "the log is empty: there is no frame*.jpg.", file=results, hint="render frame000000.jpg, ... there"
             )
+        self.stamps = [index / _RATE for index in range(len(self._colors))]
         self._reader = RgbdReader(find_calibration(camera) if camera is not None else self._calibration())
 
     @cached_property
@@ -49,13 +51,10 @@ class ReplicaLog(FolderLog):
         poses = [_parse_pose(path, i, line) for i, line in enumerate(lines, 1) if line.strip()]
         return Trajectory(np.arange(len(poses)) / _RATE, np.array(poses).reshape(-1, 4, 4))
 
-    def __len__(self) -> int:
-        return len(self._colors)
-
     def _decode(self, index: int) -> Frame:
         color = self._colors[index]
         depth = color.with_name(f"depth{color.stem.removeprefix('frame')}.png")
-        return self._reader.read(index, index / _RATE, color, depth)
+        return self._reader.read(index, self.stamps[index], color, depth)
 
     def _calibration(self) -> Calibration:
         places = [folder / "cam_params.json" for folder in (self.folder, self.folder.resolve().parent)]

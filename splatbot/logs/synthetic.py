@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from splatbot.camera import Camera
 from splatbot.errors import InputError, LogError
 from splatbot.frame import Frame
-from splatbot.logs.base import LogBase
+from splatbot.logs.base import StampedLog
 from splatbot.logs.effects import Account, FrameEffects, make_effects
 from splatbot.logs.scenes import SCENES, RaycastScene, SceneKind
 from splatbot.logs.trajectories import MotionOptions, make_path
@@ -61,7 +61,7 @@ _BOUNDS: dict[str, tuple[float, float]] = {
 }
 
 
-class SyntheticLog(LogBase):
+class SyntheticLog(StampedLog):
     """Frames of a scene, rendered on access without a cache; equal values of ``uri`` give bit-identical frames.
 
     Raises:
@@ -86,6 +86,7 @@ class SyntheticLog(LogBase):
         )
         if not self._kept:
             raise LogError("no frame is left.", file=uri, field="effects", hint="drop fewer frames, or take more")
+        self.stamps = [float(self.ground_truth.stamps[i]) for i in self._kept]
 
     @cached_property
     def camera(self) -> Camera:
@@ -128,9 +129,6 @@ class SyntheticLog(LogBase):
         return self.scene.moving_mask(
             self.camera, self.ground_truth.T_world_camera[i], float(self.ground_truth.stamps[i])
         )
-
-    def __len__(self) -> int:
-        return len(self._kept)
 
     def _decode(self, index: int) -> Frame:
         i = self._kept[index]

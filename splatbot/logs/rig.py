@@ -1,0 +1,187 @@
+"""Several recordings of one scene, each by a camera of its own, as one log: a YAML file lists them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import ValidationError
+
+from splatbot.camera import Camera
+from splatbot.config import CameraConfig
+from splatbot.errors import ConfigError, LogError
+from splatbot.frame import Frame
+from splatbot.layouts import log_kind
+from splatbot.logs.base import Log, StampedLog
+from splatbot.logs.calibration import Calibration
+from splatbot.trajectory import Trajectory
+
+MAX_CAMERAS = 8
+"""Largest number of cameras of a rig."""
+
+_NAME = re.compile(r"[A-Za-z0-9_-]{1,32}")
+_FIRST_KEYS = {"log", "camera", "time_offset"}
+_MAX_OFFSET_S = 1e6
+_HINT = "write `cameras: {wrist: {log: FOLDER}, table: {log: FOLDER, T_world_camera: {...}}}`"
+
+Opener = Callable[[str, str | None], Log]
+"""Opens the recording of a camera: its address, and the file with its intrinsics or None."""
+
+
+@dataclass(frozen=True)
+class RigCamera:
+    """One camera of a rig.
+
+    Args:
+        name: its name in the file.
+        log: its recording.
+        time_offset: time [s] that is added to the stamps of its frames.
+    """
+
+    name: str
+    log: Log
+    time_offset: float
+
+    @property
+    def stamps(self) -> list[float]:
+        """Stamps of the frames [s]; a recording that does not know them is decoded."""
+        known = self.log.stamps if isinstance(self.log, StampedLog) else [frame.stamp for frame in self.log]
+        return [stamp + self.time_offset for stamp in known]
+
+
+class RigLog(StampedLog):
+    """The frames of several cameras in the order of their stamps; the first camera of the file defines the world.
+
+    Frames of the first camera have no ``camera_name``; the others have the name of their camera. Name, intrinsics,
+    calibration and reference poses of the log are those of the first camera.
+
+    Args:
+        path: YAML file with the mapping ``cameras`` from names to ``log``, ``camera``, ``time_offset`` and the keys of
+            :class:`splatbot.config.CameraConfig`. Paths are relative to the file.
+        opener: opens one recording.
+
+    Raises:
+        LogError: the file is damaged, or names a recording that does not exist or is damaged.
+        CameraError: there are no usable intrinsics.
+    """
+
+    def __init__(self, path: str | Path, opener: Opener) -> None:
+        self.uri, self.name = str(path), Path(path).stem
+        self._file = Path(path)
+        entries = _entries(self._file)
+        self._parts = [self._part(name, values, opener) for name, values in entries.items()]
+        self._cameras = {part.name: self._config(part, entries[part.name]) for part in self._parts[1:]}
+        ordered = sorted((t, k, i) for k, part in enumerate(self._parts) for i, t in enumerate(part.stamps))
+        self.stamps = [stamp for stamp, _, _ in ordered]
+        self._places = [(part, index) for _, part, index in ordered]
+
+    @property
+    def camera(self) -> Camera:
+        """Camera of the frames of the first camera: undistorted."""
+        return self._parts[0].log.camera
+
+    @property
+    def ground_truth(self) -> Trajectory | None:
+        """Reference poses of the first camera, see :class:`splatbot.logs.Log`."""
+        truth, offset = self._parts[0].log.ground_truth, self._parts[0].time_offset
+        return truth if truth is None or not offset else replace(truth, stamps=truth.stamps + offset)
+
+    @property
+    def effects(self) -> list[dict[str, Any]]:
+        """Records of the simulated effects of the first camera."""
+        return self._parts[0].log.effects
+
+    @property
+    def cameras(self) -> Mapping[str, CameraConfig]:
+        """Further cameras by their name, in the order of the file."""
+        return self._cameras
+
+    @property
+    def calibration(self) -> Calibration:
+        """Calibration of the first camera."""
+        return self._parts[0].log.calibration
+
+    def _decode(self, index: int) -> Frame:
+        number, at = self._places[index]
+        part = self._parts[number]
+        frame = part.log.read(at)
+        name = part.name if number else ""
+        return replace(frame, index=index, stamp=frame.stamp + part.time_offset, camera_name=name)
+
+    def _part(self, name: str, values: Mapping[str, Any], opener: Opener) -> RigCamera:
+        where, offset = f"cameras.{name}", values.get("time_offset", 0.0)
+        if isinstance(offset, bool) or not isinstance(offset, int | float) or not abs(offset) <= _MAX_OFFSET_S:
+            raise self._wrong(f"{where}.time_offset", f"is {offset!r:.40}.", "give seconds")
+        for key in ("log", "camera"):
+            if not isinstance(values.get(key, ""), str):
+                raise self._wrong(f"{where}.{key}", "is no text.", "give a path")
+        if not values.get("log"):
+            raise self._wrong(f"{where}.log", "is missing.", _HINT)
+        camera, address = values.get("camera"), self._beside(values["log"])
+        if log_kind(address) == "rig":
+            raise self._wrong(f"{where}.log", "is a rig itself.", "name the recordings of its cameras")
+        return RigCamera(name, opener(address, self._beside(camera) if camera else None), float(offset))
+
+    def _beside(self, address: str) -> str:
+        """Return an address, or the path of a file or folder relative to that of the rig."""
+        local = self._file.parent / address
+        path, mark, options = str(local).partition("?")
+        return path + mark + options if Path(path).exists() or local.exists() else address
+
+    def _config(self, part: RigCamera, values: Mapping[str, Any]) -> CameraConfig:
+        own = {key: value for key, value in values.items() if key not in _FIRST_KEYS}
+        sensor = own.get("sensor") or {}
+        if isinstance(sensor, dict):
+            own["sensor"] = {**part.log.calibration.sensor, **sensor}
+        try:
+            return CameraConfig.model_validate(own)
+        except ValidationError as error:
+            first = error.errors()[0]
+            key = ".".join(["cameras", part.name, *(str(place) for place in first["loc"])])
+            hint = f"the keys are log, camera, time_offset, {', '.join(CameraConfig.model_fields)}"
+            raise self._wrong(key, f"{first['msg']}.", hint) from error
+
+    def _wrong(self, field: str, message: str, hint: str) -> LogError:
+        return LogError(message, file=self._file, field=field, hint=hint)
+
+
+def _entries(file: Path) -> dict[str, dict[str, Any]]:
+    """Return the values of each camera of a file, the first one first."""
+    try:
+        found = yaml.safe_load(file.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise LogError(f"is no YAML file: {error}.", file=file, hint=_HINT) from error
+    cameras = found.get("cameras") if isinstance(found, dict) else None
+    if not isinstance(cameras, dict) or not 1 <= len(cameras) <= MAX_CAMERAS:
+        raise LogError(f"lists no cameras, or more than {MAX_CAMERAS}.", file=file, field="cameras", hint=_HINT)
+    for number, (name, values) in enumerate(cameras.items()):
+        if not isinstance(name, str) or not _NAME.fullmatch(name):
+            hint = "use letters, digits, - and _"
+            raise LogError(f"has the name {name!r:.40}.", file=file, field="cameras", hint=hint)
+        if not isinstance(values, dict):
+            raise LogError("is no mapping.", file=file, field=f"cameras.{name}", hint=_HINT)
+        if number == 0 and not values.keys() <= _FIRST_KEYS:
+            key = min(values.keys() - _FIRST_KEYS, key=str)
+            hint = "the first camera defines the world; its sensor is the section `sensor` of --config or of its log"
+            raise LogError("is not for the first camera.", file=file, field=f"cameras.{name}.{key}", hint=hint)
+    return cameras
+
+
+def check_same_cameras(log: Log, cameras: Mapping[str, CameraConfig]) -> None:
+    """Check that a log has the further cameras of a saved run.
+
+    Raises:
+        ConfigError: it has others.
+    """
+    if dict(log.cameras) != dict(cameras):
+        names = ", ".join(cameras) or "none"
+        raise ConfigError(
+            f"are not those of the run ({names}).",
+            file=log.uri,
+            field="cameras",
+            hint="restore the file of the rig, or map the log again",
+        )
