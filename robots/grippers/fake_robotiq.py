@@ -2,48 +2,22 @@
 
 from __future__ import annotations
 
-import os
-import pty
-import select
-import threading
 import time
-import tty
-from contextlib import AbstractContextManager
-from dataclasses import dataclass
-from types import TracebackType
 
 import numpy as np
 
 from splatbot.errors import InputError
-from splatbot.robots.grippers.modbus import EXCEPTION, READ, READ_INPUT, WRITE, FramingError, framed, unframed
+from splatbot.robots.grippers.fake_line import FakeLine, LineFaults
+from splatbot.robots.grippers.line import FramingError
+from splatbot.robots.grippers.modbus import EXCEPTION, READ, READ_INPUT, WRITE, framed, unframed
 from splatbot.robots.grippers.registers import COMMAND, REGISTERS, STATUS, Activation, Command, Fingers, Status
 from splatbot.robots.grippers.robotiq import MODELS
 
-_SILENCE = 0.004  # [s] that ends a frame
 _TOO_EARLY, _NOT_ACTIVATED, _RELEASED = 0x05, 0x07, 0x0F  # gFLT
 _HOLDING_CURRENT = 100  # [mA]
 
 
-@dataclass
-class LineFaults:
-    """Faults of the serial line; they may be changed at any time.
-
-    Args:
-        drop: fraction of lost bytes in both directions.
-        flip: fraction of bytes with one wrong bit.
-        half: fraction of responses that end in the middle.
-        delay: delay before each response [s].
-        silent: True suppresses all responses.
-    """
-
-    drop: float = 0.0
-    flip: float = 0.0
-    half: float = 0.0
-    delay: float = 0.0
-    silent: bool = False
-
-
-class FakeRobotiq(AbstractContextManager["FakeRobotiq"]):
+class FakeRobotiq(FakeLine):
     """Gripper whose fingers move at their speed, stop at an object, and respond on the serial port ``port``.
 
     Args:
@@ -71,65 +45,34 @@ class FakeRobotiq(AbstractContextManager["FakeRobotiq"]):
         if model not in MODELS:
             raise InputError(f"is {model!r}.", field="model", hint=f"models: {', '.join(MODELS)}")
         self.model, self.hurry, self._device = MODELS[model], hurry, device
-        self.width, self.faults = width, faults if faults is not None else LineFaults()
+        self.width = width
         self.fault = 0  # gFLT that it reports until it is reset
-        self.requests: list[bytes] = []  # complete requests
-        self._rng = np.random.default_rng(seed)
         self._command = Command(activate=False, go=False)
         self._position = float(self.model.open_at)
         self._ready_at: float | None = None  # None without activation
         self._stopped = Fingers.THERE
         self._last = time.monotonic()
-        self._master, self._slave = pty.openpty()
-        tty.setraw(self._slave)
-        self.port = os.ttyname(self._slave)
-        self._plugged = True
-        self._thread = threading.Thread(target=self._serve, name="fake-robotiq", daemon=True)
-        self._thread.start()
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
-        self.unplug()
+        super().__init__(faults, seed=seed)
 
     @property
     def commanded(self) -> Command:
         """Last command."""
         return self._command
 
-    def unplug(self) -> None:
-        """Close the port permanently."""
-        if self._plugged:
-            self._plugged = False
-            self._thread.join()
-            os.close(self._master)
-            os.close(self._slave)
+    def _length(self, data: bytes) -> int:
+        if len(data) < 7:
+            return 8
+        return 9 + data[6] if data[1] == WRITE else 8
 
-    def _serve(self) -> None:
-        data = b""
-        while self._plugged:
-            ready, _, _ = select.select([self._master], [], [], _SILENCE)
-            if not ready:
-                data = b""  # silence ends a frame, whole or not
-                continue
-            data += self._through(os.read(self._master, 256))
-            if len(data) >= _request_length(data):
-                self._take(data)
-                data = b""
-
-    def _take(self, data: bytes) -> None:
+    def _respond(self, request: bytes) -> bytes | None:
         try:
-            body = unframed(data)
+            body = unframed(request)
         except FramingError:
-            return
+            return None
         if body[0] != self._device:
-            return
+            return None
         self.requests.append(body)
-        answer = framed(self._answer(body))
-        time.sleep(self.faults.delay)
-        if self.faults.silent:
-            return
-        if self._rng.random() < self.faults.half:
-            answer = answer[: len(answer) // 2]
-        os.write(self._master, self._through(answer))
+        return framed(self._answer(body))
 
     def _answer(self, body: bytes) -> bytes:
         function, address = body[1], int.from_bytes(body[2:4], "big")
@@ -195,17 +138,3 @@ class FakeRobotiq(AbstractContextManager["FakeRobotiq"]):
             position=round(self._position),
             current=_HOLDING_CURRENT if self._stopped is Fingers.STOPPED_CLOSING else 0,
         )
-
-    def _through(self, data: bytes) -> bytes:
-        """Apply the faults of the line to bytes."""
-        if not (self.faults.drop or self.faults.flip):
-            return data
-        kept = [byte for byte in data if self._rng.random() >= self.faults.drop]
-        return bytes(b ^ 1 << int(self._rng.integers(8)) if self._rng.random() < self.faults.flip else b for b in kept)
-
-
-def _request_length(data: bytes) -> int:
-    """Return the length of a request from its first bytes."""
-    if len(data) < 7:
-        return 8
-    return 9 + data[6] if data[1] == WRITE else 8

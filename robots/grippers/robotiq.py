@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
-from types import TracebackType
 
 from splatbot.errors import GripperError, InputError
 from splatbot.robots.grippers.checks import check_move
-from splatbot.robots.grippers.modbus import LineError, ModbusClient, open_line
+from splatbot.robots.grippers.errors import FaultError
+from splatbot.robots.grippers.line import LineGripper, open_line
+from splatbot.robots.grippers.modbus import BAUD, ModbusClient
 from splatbot.robots.grippers.registers import (
     COMMAND,
     NO_COMMUNICATION,
@@ -29,7 +28,7 @@ class RobotiqConstants:
     """Constants of the communication with a Robotiq gripper.
 
     Args:
-        poll_period: [s] time between two status requests.
+        poll_period: [s] time between two status requests that wait for the echo.
         echo_timeout: [s] time within which the status must echo the commanded position.
     """
 
@@ -41,14 +40,6 @@ CONSTANTS = RobotiqConstants()
 
 
 _log = logging.getLogger(__name__)
-
-
-class FaultError(GripperError):
-    """The gripper reports a fault, which ``status`` contains."""
-
-    def __init__(self, status: Status, *, field: str) -> None:
-        self.status = status
-        super().__init__(f"reports fault {status.fault:#04x}: {status.fault_text}.", field=field, hint="activate it")
 
 
 @dataclass(frozen=True)
@@ -88,12 +79,8 @@ MODELS = {
 }
 
 
-class RobotiqGripper(AbstractContextManager["RobotiqGripper"]):
+class RobotiqGripper(LineGripper[ModbusClient]):
     """A :class:`splatbot.protocols.Gripper` on a serial port.
-
-    Every failure (no response, repeated wrong checksums, a lost port, a fault) raises
-    :class:`splatbot.errors.GripperError`. The driver then sends one stop command and refuses moves until the gripper is
-    activated again. No call lasts longer than its time-outs.
 
     Args:
         port: serial port, as "/dev/ttyUSB0".
@@ -112,31 +99,14 @@ class RobotiqGripper(AbstractContextManager["RobotiqGripper"]):
     ) -> None:
         if model not in MODELS:
             raise InputError(f"is {model!r}.", field="model", hint=f"models: {', '.join(MODELS)}")
-        if not 0.0 < timeout <= 10.0 or not 0 <= retries <= 100:
-            raise InputError(f"are {timeout}, {retries}.", field="timeout, retries", hint="give seconds, and a number")
-        self.model = MODELS[model]
-        self._port, self._device, self._timeout, self._retries = port, device, timeout, retries
-        self._unsafe = "it is not activated"
+        self.model, self._device = MODELS[model], device
         self._sent: Command | None = None
-        self._client: ModbusClient | None = self._opened()
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
-        self.close()
+        super().__init__(port, timeout=timeout, retries=retries)
 
     @property
     def stroke(self) -> float:
         """Widest opening [m]."""
         return self.model.stroke
-
-    @property
-    def unsafe(self) -> str:
-        """Reason why moves are refused; empty if they are accepted."""
-        return self._unsafe
-
-    @property
-    def repeated(self) -> int:
-        """Number of repeated exchanges since the port was opened."""
-        return self._client.repeated if self._client is not None else 0
 
     def activate(self, *, again: bool = False, patience: float = 10.0) -> None:
         """Clear faults and activate the gripper; the fingers close and open once.
@@ -147,15 +117,14 @@ class RobotiqGripper(AbstractContextManager["RobotiqGripper"]):
             GripperError: it does not become ready within ``patience`` [s].
         """
         with self._secured():
-            if self._client is None:
-                self._client = self._opened()
-            self._sent, self._unsafe = None, "it is not activated"
+            self._reopen()
+            self._sent = None
             status = self._read()
             if again or status.fault not in (0, NO_COMMUNICATION) or status.activation is not Activation.DONE:
                 self._write(Command(activate=False, go=False))
-                self._until(lambda s: not s.activated, patience, "does not reset", read=self._read)
+                self._until(lambda: not self._read().activated, patience, "does not reset")
                 self._write(Command(go=False))
-                self._until(lambda s: s.activation is Activation.DONE, patience, "is not ready")
+                self._until(lambda: self._status().activation is Activation.DONE, patience, "is not ready")
             self._unsafe = ""
 
     def move(self, opening: float, *, force: float | None = None, speed: float | None = None) -> None:
@@ -169,8 +138,7 @@ class RobotiqGripper(AbstractContextManager["RobotiqGripper"]):
             GripperError: the gripper is not activated, or the command fails.
         """
         check_move(self.stroke, opening, force, speed)
-        if self._unsafe:
-            raise GripperError(f"takes no move: {self._unsafe}.", field=self._port, hint="activate it")
+        self._check_safe()
         with self._secured():
             self._sent = Command(
                 position=self.model.position(opening),
@@ -189,11 +157,6 @@ class RobotiqGripper(AbstractContextManager["RobotiqGripper"]):
         with self._secured():
             return self._status()
 
-    def moving(self) -> bool:
-        """Return whether the fingers move."""
-        status = self.status()
-        return status.going and status.fingers is Fingers.MOVING
-
     def opening(self) -> float:
         """Return the distance between the fingers [m]."""
         return self.model.opening(self.status().position)
@@ -202,15 +165,6 @@ class RobotiqGripper(AbstractContextManager["RobotiqGripper"]):
         """Return whether an object stops the fingers; after :meth:`stop` this is unknown, and False."""
         status = self.status()
         return status.going and status.fingers in (Fingers.STOPPED_CLOSING, Fingers.STOPPED_OPENING)
-
-    def wait(self, seconds: float = 5.0) -> None:
-        """Wait until the fingers stop.
-
-        Raises:
-            GripperError: they still move after ``seconds`` [s]; a stop command is then sent.
-        """
-        with self._secured():
-            self._until(lambda s: not (s.going and s.fingers is Fingers.MOVING), seconds, "still moves")
 
     def stop(self) -> None:
         """Stop the fingers; a grasped object stays grasped.
@@ -250,20 +204,17 @@ class RobotiqGripper(AbstractContextManager["RobotiqGripper"]):
         self.model = replace(self.model, open_at=opened, closed_at=closed)
         return self.model
 
-    def close(self) -> None:
-        """Close the port; a grasped object stays grasped."""
-        if self._client is not None:
-            self._client.close()
-        self._client, self._unsafe = None, "its port is closed"
-
     def _opened(self) -> ModbusClient:
-        return ModbusClient(open_line(self._port, timeout=self._timeout), self._device, retries=self._retries)
+        return ModbusClient(
+            open_line(self._port, baud=BAUD, timeout=self._timeout), self._device, retries=self._retries
+        )
 
-    @property
-    def _open_client(self) -> ModbusClient:
-        if self._client is None:
-            raise LineError(f"is not open: {self._unsafe}.", file=self._port, hint="activate the gripper")
-        return self._client
+    def _moves(self) -> bool:
+        status = self._status()
+        return status.going and status.fingers is Fingers.MOVING
+
+    def _halt(self, client: ModbusClient) -> None:
+        client.write(COMMAND, replace(self._sent or Command(), go=False).to_bytes(), retries=0)
 
     def _write(self, command: Command) -> None:
         self._open_client.write(COMMAND, command.to_bytes())
@@ -276,7 +227,7 @@ class RobotiqGripper(AbstractContextManager["RobotiqGripper"]):
             if status.fault == NO_COMMUNICATION:
                 _log.info("%s received no message for a second", self._port)
             elif status.fault:
-                raise FaultError(status, field=self._port)
+                raise FaultError(status.fault, status.fault_text, field=self._port)
             if self._sent is None or (status.requested, status.going) == (self._sent.position, self._sent.go):
                 return status
             if time.monotonic() > until:
@@ -286,46 +237,6 @@ class RobotiqGripper(AbstractContextManager["RobotiqGripper"]):
 
     def _read(self) -> Status:
         return Status.from_bytes(self._open_client.read(STATUS, REGISTERS))
-
-    def _until(
-        self,
-        holds: Callable[[Status], bool],
-        seconds: float,
-        failure: str,
-        read: Callable[[], Status] | None = None,
-    ) -> None:
-        until = time.monotonic() + seconds
-        while not holds((read or self._status)()):
-            if time.monotonic() > until:
-                raise GripperError(
-                    f"{failure} after {seconds:g} s.", field=self._port, hint="check its power; activate it"
-                )
-            time.sleep(CONSTANTS.poll_period)
-
-    @contextmanager
-    def _secured(self) -> Iterator[None]:
-        """Send one stop command after an error, and refuse later moves."""
-        try:
-            yield
-        except GripperError as error:
-            self._unsafe = self._unsafe or error.message.rstrip(".")
-            _log.warning("%s", error)
-            self._stand_still(lost=isinstance(error, LineError))
-            raise
-
-    def _stand_still(self, *, lost: bool) -> None:
-        if self._client is None:
-            return
-        if not lost:
-            try:
-                self._client.write(COMMAND, replace(self._sent or Command(), go=False).to_bytes(), retries=0)
-            except LineError:
-                lost = True
-            except GripperError as error:
-                _log.warning("it may still move: %s", error)
-        if lost:
-            self._client.close()
-            self._client = None
 
 
 def _register(value: float | None, smallest: float, largest: float, *, default: int) -> int:

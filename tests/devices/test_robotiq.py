@@ -14,9 +14,8 @@ import pytest
 from splatbot.errors import GripperError, InputError
 from splatbot.protocols import Gripper
 from splatbot.robots.grippers import FakeRobotiq, LineFaults, RobotiqGripper
-from splatbot.robots.grippers.modbus import LineError, NoAnswerError, RefusedError
+from splatbot.robots.grippers.errors import FaultError, LineError, NoAnswerError, RefusedError
 from splatbot.robots.grippers.registers import Fingers
-from splatbot.robots.grippers.robotiq import FaultError
 
 HURRY = 20.0
 
@@ -116,7 +115,7 @@ def test_a_fault_is_an_error_that_names_it_and_ends_with_an_activation(
     device.fault = 0x0E
     with pytest.raises(FaultError, match="current was too high") as caught:
         gripper.wait()
-    assert caught.value.status.fault == 0x0E
+    assert caught.value.fault == 0x0E
     assert not device.commanded.go
     with pytest.raises(GripperError, match="takes no move"):
         gripper.move(0.02)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from splatbot.errors import GripperError
-from splatbot.robots.grippers.modbus import FramingError, crc16, framed, unframed
+from splatbot.robots.grippers.line import FramingError
+from splatbot.robots.grippers.modbus import crc16, framed, unframed
 from splatbot.robots.grippers.registers import Activation, Command, Fingers, Status
 from splatbot.robots.grippers.robotiq import MODELS
 
