@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Protocol, Self
 
 import cv2
 import numpy as np
@@ -16,6 +16,8 @@ Array = NDArray[np.float64]
 
 MIN_CORNERS = 8
 """Least number of corners of a view that is used [1]: a pose has 6 unknowns, two of them for each corner."""
+MAX_COUNT, MAX_LENGTH = 100, 10.0
+"""Largest number of columns and of rows [1], and largest length [m] of a board's parts."""
 _SPEC = "charuco:COLUMNSxROWS:SQUARE:MARKER[:DICTIONARY][:legacy], as charuco:10x14:0.07:0.04"
 _DICTIONARIES = ("4X4", "5X5", "6X6", "7X7")
 _SIZES = (50, 100, 250, 1000)
@@ -45,6 +47,22 @@ class BoardView:
         return bool(spread[1] > 0.05 * spread[0])
 
 
+class Board(Protocol):
+    """A flat board with known corners."""
+
+    def completed(self, image: NDArray[np.uint8]) -> Self:
+        """Return the board with the properties that its description leaves open, as an image shows them.
+
+        Raises:
+            InputError: the image shows fewer than 8 corners.
+        """
+        ...
+
+    def detect(self, image: NDArray[np.uint8]) -> BoardView:
+        """Find the corners of an image (H, W) or (H, W, 3); without the board, 0 corners."""
+        ...
+
+
 @dataclass(frozen=True)
 class CharucoBoard:
     """Chessboard with ArUco markers in its white squares.
@@ -69,9 +87,11 @@ class CharucoBoard:
     legacy: bool | None = None
 
     def __post_init__(self) -> None:
-        if not (2 <= self.columns <= 100 and 2 <= self.rows <= 100):
-            raise InputError(f"has {self.columns}x{self.rows} squares.", field="board", hint="give 2 to 100 each")
-        if not 0.0 < self.marker < self.square <= 10.0:
+        if not (2 <= self.columns <= MAX_COUNT and 2 <= self.rows <= MAX_COUNT):
+            raise InputError(
+                f"has {self.columns}x{self.rows} squares.", field="board", hint=f"give 2 to {MAX_COUNT} each"
+            )
+        if not 0.0 < self.marker < self.square <= MAX_LENGTH:
             hint = "give both in metres, the marker smaller than the square"
             raise InputError(f"has squares of {self.square} and markers of {self.marker} m.", field="board", hint=hint)
         if self.dictionary and self.dictionary not in dictionaries():
@@ -135,7 +155,7 @@ class CharucoBoard:
         Raises:
             InputError: the board has no dictionary.
         """
-        corners, ids, _, _ = self._detector.detectBoard(_grey(image))
+        corners, ids, _, _ = self._detector.detectBoard(grey(image))
         if ids is None or corners is None:
             return BoardView(np.zeros((0, 3)), np.zeros((0, 2)))
         chosen = np.asarray(ids).reshape(-1)
@@ -147,7 +167,7 @@ class CharucoBoard:
         dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name}"))
         if len(dictionary.bytesList) < needed:
             return 0
-        ids = cv2.aruco.ArucoDetector(dictionary).detectMarkers(_grey(image))[1]
+        ids = cv2.aruco.ArucoDetector(dictionary).detectMarkers(grey(image))[1]
         return 0 if ids is None else int((np.unique(ids) < needed).sum())
 
     @cached_property
@@ -170,5 +190,6 @@ def dictionaries() -> tuple[str, ...]:
     return (*aruco, "ARUCO_ORIGINAL", "APRILTAG_36h11", "APRILTAG_25h9", "APRILTAG_16h5")
 
 
-def _grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return the brightness (H, W) of an image (H, W) or (H, W, 3) RGB."""
     return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)

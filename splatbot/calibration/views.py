@@ -11,7 +11,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from splatbot.calibration.board import BoardView, CharucoBoard
+from splatbot.calibration.board import Board, BoardView
 from splatbot.errors import CameraError, FormatError, InputError, LogError
 from splatbot.geometry import nearest_rotation
 from splatbot.logs import Log, open_log
@@ -111,7 +111,7 @@ class BoardRecording:
 
 
 def find_board(
-    source: ViewSource, board: CharucoBoard, *, max_views: int, on_share: Callable[[float], None]
+    source: ViewSource, board: Board, *, max_views: int, on_share: Callable[[float], None]
 ) -> BoardRecording:
     """Find a board in images. The first image that shows it completes an unknown dictionary or pattern.
 

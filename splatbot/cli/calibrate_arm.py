@@ -32,11 +32,15 @@ def calibrate_intrinsics_command(
     max_views: int = _MAX_VIEWS,
     quiet: bool = False,
 ) -> int:
-    """Estimate focal lengths, principal point and distortion of a camera from views of a ChArUco board.
+    """Estimate focal lengths, principal point and distortion of a camera from views of a board.
 
-    Boards have the form charuco:COLUMNSxROWS:SQUARE:MARKER[:DICTIONARY][:legacy] with numbers of squares and lengths in
-    metres. The dictionary and the legacy pattern are found in the images if they are not given. Take 20 images or more
-    from different sides, with the board up to the corners of the image.
+    Boards have lengths in metres:
+    - charuco:COLUMNSxROWS:SQUARE:MARKER[:DICTIONARY][:legacy], with numbers of squares
+    - apriltag:COLUMNSxROWS:TAG:GAP[:FAMILY], Kalibr's grid, with numbers of tags
+    - grid:COLUMNSxROWS:MARKER:GAP[:DICTIONARY], OpenCV's grid, with numbers of markers
+
+    The images show the dictionary if it is not given. Take 20 images or more from different sides, with the board up to
+    the corners of the image.
 
     Examples:
         splatbot calibrate intrinsics images --board charuco:10x14:0.07:0.04 --out camera.json
@@ -44,7 +48,7 @@ def calibrate_intrinsics_command(
 
     Args:
         views: folder of images, or a log.
-        board: the board, as charuco:10x14:0.07:0.04.
+        board: the board, as charuco:10x14:0.07:0.04 or apriltag:6x6:0.088:0.0264.
         out: camera file to write; by default only the table is printed.
         depth_scale: units of the depth images per metre, for the camera file; by default those of the log, or 1000.
         max_views: largest number of images that are used, evenly spread.
@@ -94,7 +98,7 @@ def calibrate_hand_eye_command(
 ) -> int:
     """Estimate the pose of a camera on an arm, with joint offsets and a time offset.
 
-    With a board: images or a log show a static ChArUco board from the camera on the arm. With --eye-to-hand, they show
+    With a board: images or a log show a static board from the camera on the arm. With --eye-to-hand, they show
     a board on the arm from a static camera. Each image has the arm's joints or pose: in a YAML file of its name
     (joint_values, T_base_link), or in the log. The arm is at rest in each image.
 
@@ -177,14 +181,14 @@ def _announce(out: Path, quiet: bool) -> None:
 
 def _find_board(source: ViewSource, board: str, max_views: int, quiet: bool) -> BoardRecording:
     """Return the views of a board, with progress and a note of damaged frames."""
-    from splatbot.calibration.board import CharucoBoard
+    from splatbot.calibration.board_spec import parse_board
     from splatbot.calibration.views import find_board
     from splatbot.cli.progress import shares
     from splatbot.errors import InputError
 
     if max_views < 1:
         raise InputError(f"is {max_views}.", field="--max-views", hint="give 20 to 200")
-    spec = CharucoBoard.parse(board)
+    spec = parse_board(board)
     with shares(quiet) as show:
         recording = find_board(source, spec, max_views=max_views, on_share=lambda share: show("board", share))
     if source.skipped:
