@@ -9,16 +9,15 @@ import json
 import threading
 import time
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from websockets.exceptions import WebSocketException
-from websockets.sync.server import Server, ServerConnection, serve
+from websockets.sync.server import ServerConnection
 
 from splatbot.protocols import Array
+from tests.fake_rosbridge import FakeRosbridge
 
 ACTION = "/joint_trajectory_controller/follow_joint_trajectory"
 _PERIOD_S = 0.008
@@ -72,7 +71,7 @@ class Goal:
     ended: threading.Event = field(default_factory=threading.Event)
 
 
-class FakeRosArm:
+class FakeRosArm(FakeRosbridge):
     """An arm with a rosbridge server on a free port of this machine.
 
     Args:
@@ -97,68 +96,14 @@ class FakeRosArm:
         self.goals: list[Mapping[str, Any]] = []
         self.cancels, self.stalled = 0, False
         self.clock_offset = 0.0
-        self._sockets: dict[ServerConnection, set[str]] = {}
-        self._lock = threading.RLock()
         self._goal: Goal | None = None
-        self._ended = threading.Event()
-        self._server = self._serve(0)
-        self.port = int(self._server.socket.getsockname()[1])
-        self._arm = threading.Thread(target=self._live, daemon=True)
-        self._arm.start()
-
-    @property
-    def address(self) -> str:
-        return f"ws://127.0.0.1:{self.port}"
-
-    def __enter__(self) -> FakeRosArm:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._ended.set()
-        self._arm.join()
-        self._cut()
-
-    def say(self, text: str) -> None:
-        """Send a text to all clients."""
-        with self._lock:
-            for socket in self._sockets:
-                self._send(socket, text)
-
-    def _serve(self, port: int) -> Server:
-        server = serve(self._talk, "127.0.0.1", port, max_size=None)
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        return server
-
-    def _cut(self) -> None:
-        self._server.shutdown()
-        with self._lock:
-            sockets = list(self._sockets)
-        for socket in sockets:
-            with suppress(OSError):
-                socket.socket.shutdown(2)
-
-    def _restart(self) -> None:
-        self._cut()
-        time.sleep(self.behaviour.down_s)
-        if not self._ended.is_set():
-            self._server = self._serve(self.port)
+        super().__init__(_PERIOD_S)
 
     # -- one client --------------------------------------------------------------------------------------------------
 
-    def _talk(self, socket: ServerConnection) -> None:
-        with self._lock:
-            self._sockets[socket] = set()
-        with suppress(WebSocketException, OSError):
-            for text in socket:
-                self._take(socket, json.loads(text))
-        with self._lock:
-            del self._sockets[socket]
-
     def _take(self, socket: ServerConnection, operation: dict[str, Any]) -> None:
         kind, topic = operation["op"], operation.get("topic", "")
-        if kind == "subscribe":
-            self._sockets[socket].add(topic)
-        elif self.ros == 2 and kind == "send_action_goal":
+        if self.ros == 2 and kind == "send_action_goal":
             assert operation["action"] == ACTION
             assert operation["action_type"] == "control_msgs/action/FollowJointTrajectory"
             self._begin(socket, operation["id"], operation["args"])
@@ -210,15 +155,11 @@ class FakeRosArm:
 
     # -- the arm -----------------------------------------------------------------------------------------------------
 
-    def _live(self) -> None:
-        ticks = 0
-        while not self._ended.wait(_PERIOD_S):
-            ticks += 1
-            with self._lock:
-                if self._goal is not None:
-                    self._control(self._goal, time.monotonic() - self._goal.started, ticks)
-                if ticks % 2 == 0 and not self.stalled:
-                    self._report_states()
+    def _tick(self, ticks: int) -> None:
+        if self._goal is not None:
+            self._control(self._goal, time.monotonic() - self._goal.started, ticks)
+        if ticks % 2 == 0 and not self.stalled:
+            self._report_states()
 
     def _control(self, goal: Goal, t: float, ticks: int) -> None:
         faults = self.behaviour
@@ -235,7 +176,7 @@ class FakeRosArm:
         self.stalled = self.stalled or t >= faults.stall_at
         if t >= faults.drop_at:
             faults.drop_at = np.inf
-            threading.Thread(target=self._restart, daemon=True).start()
+            self._restart(faults.down_s)
         if faults.lies:
             self._send_result(goal, _SUCCEEDED[self.ros], 0)
             faults.lies = False
@@ -298,16 +239,6 @@ class FakeRosArm:
         given = [] if self.behaviour.positions_only else velocity.tolist()
         header = {"stamp": stamp, "frame_id": ""}
         return {"header": header, "name": list(names), "position": position.tolist(), "velocity": given, "effort": []}
-
-    def _publish(self, topic: str, message: dict[str, Any]) -> None:
-        text = json.dumps({"op": "publish", "topic": topic, "msg": message})
-        for socket, topics in self._sockets.items():
-            if topic in topics:
-                self._send(socket, text)
-
-    def _send(self, socket: ServerConnection, text: str) -> None:
-        with suppress(WebSocketException, OSError):
-            socket.send(text)
 
 
 def quintic(times: Array, points: Array, t: float) -> Array:
