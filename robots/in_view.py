@@ -17,7 +17,12 @@ from splatbot.workspace import NAME, Workspace, find_workspace
 
 
 def self_mask(
-    robot: RobotKinematics, workspace: Workspace | None, *, held: ArrayLike | None = None, file: str | Path = NAME
+    robot: RobotKinematics,
+    workspace: Workspace | None,
+    *,
+    held: ArrayLike | None = None,
+    file: str | Path = NAME,
+    needs_camera: bool = True,
 ) -> SelfMask:
     """Return the mask of a robot for the camera that a workspace describes.
 
@@ -26,11 +31,13 @@ def self_mask(
         workspace: camera on its link, and the joints' names and offsets.
         held: (A, 4) spheres (x, y, z, radius) [m] of an object in the hand, in the frame of the last link.
         file: origin of the workspace, for messages.
+        needs_camera: refuse a workspace without the pose of the camera. Otherwise TF must give this pose.
 
     Raises:
         InputError: the pose of the camera is unknown, or the workspace does not fit the robot.
     """
-    if workspace is None or workspace.T_link_camera is None:
+    workspace = workspace or Workspace()
+    if workspace.T_link_camera is None and needs_camera:
         raise InputError(
             "has no T_link_camera.",
             file=file,

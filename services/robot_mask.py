@@ -1,4 +1,4 @@
-"""The robot's own body in live frames: masked by the joint states at the time of each image."""
+"""The robot's own body in live frames: masked by the joint states, or by TF, at the time of each image."""
 
 from __future__ import annotations
 
@@ -14,12 +14,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from splatbot.errors import InputError
 from splatbot.frame import Frame
+from splatbot.geometry import inverse, transform_points
 from splatbot.logs.joints import MAX_GAP, interpolate_joints, select_joints
-from splatbot.mapping.selfmask import JointsUnknownError
-from splatbot.protocols import FrameSource
+from splatbot.mapping.selfmask import REACH, JointsUnknownError
+from splatbot.protocols import Array, FrameSource
 from splatbot.robots.in_view import self_mask
+from splatbot.robots.link_frames import link_frames
 from splatbot.robots.robot import RobotModel
-from splatbot.services.topics import JointState
+from splatbot.services.ros.robot_topics import RobotTopics
+from splatbot.services.topics import JointState, RosFrame
 from splatbot.workspace import Workspace
 
 MAX_HELD = 64
@@ -28,6 +31,7 @@ _KEPT_S = 10.0  # [s] of joint states
 _SET_BACK_S = 0.5  # [s] by which a state may be older than the newest one
 _KEPT = 20_000  # joint states: 2 kHz over that time
 _WAIT_S = 0.15  # [s] for the joint state after an image
+_TILT = 0.05  # [rad] by which the axis of a joint in TF may differ from the model
 _SAME_TIME_S = 1e-3  # [s] between colour and depth in which an arm moves by less than the noise of depth
 _REPORT_S = 10.0  # [s] between two warnings about frames that are not mapped
 
@@ -93,6 +97,11 @@ class JointHistory:
             self._changed.notify_all()
         return True
 
+    def reaches(self, stamp: float) -> bool:
+        """Return whether the newest joint state is at most 0.1 s before a stamp [s], or after it."""
+        with self._changed:
+            return bool(self._stamps) and self._stamps[-1] >= stamp - MAX_GAP
+
     def at(self, stamp: float, wait_s: float) -> NDArray[np.float64]:
         """Interpolate the positions (J,) [rad or m] at a stamp [s]; wait up to ``wait_s`` [s] for a later state.
 
@@ -120,25 +129,40 @@ class RobotMask:
     """Masks the robot, and the object in its hand, in the frames of one live map.
 
     A frame with joints of its own is masked by these. Otherwise its joints are those of the history at the frame's
-    stamp plus the workspace's ``joint_delay``. A frame without known joints is refused: it must not be mapped.
+    stamp plus the workspace's ``joint_delay``. Where no joint states come, the poses of the links are those of TF at
+    that time. So is the pose of the camera if it is not known on its link; then TF counts alone. A frame without known
+    joints or poses is refused: it must not be mapped.
 
     Args:
         robot: the robot.
         workspace: pose of the camera on its link, and names, offsets and delay of the joints.
+        topics: transforms and attached objects; those of a recording are not of its frames.
+        camera_in_tf: the pose of the camera may be missing in the workspace.
 
     Raises:
         InputError: the pose of the camera is unknown, or the workspace does not fit the robot.
     """
 
-    def __init__(self, robot: RobotModel, workspace: Workspace | None) -> None:
-        self._mask = self_mask(robot, workspace)
-        assert workspace is not None
-        self.robot, self._workspace = robot, workspace
-        self.history = JointHistory(workspace.joint_names or robot.chain.names)
+    def __init__(
+        self,
+        robot: RobotModel,
+        workspace: Workspace | None,
+        topics: RobotTopics | None = None,
+        *,
+        camera_in_tf: bool = False,
+    ) -> None:
+        self.robot, self._workspace, self._camera_in_tf = robot, workspace or Workspace(), camera_in_tf
+        self.topics = topics
+        self.history = JointHistory(self._workspace.joint_names or robot.chain.names)
+        self._frames = link_frames(robot, self._workspace.joint_names)
         self.masked = 0
         self.refused = 0
         self.problem: str | None = None
         self._reported = -np.inf
+        self._given = np.zeros((0, 4))
+        self._attached, self._version = np.zeros((0, 4)), 0
+        self._building = threading.Lock()
+        self._build()
 
     @property
     def joint_delay(self) -> float:
@@ -150,16 +174,18 @@ class RobotMask:
 
         Args:
             frame: the frame.
-            live: whether joint states of the history belong to the frame; those of a recording do not.
+            live: whether joint states and topics belong to the frame; those of a recording do not.
 
         Raises:
             JointsUnknownError: the joints at the time of the frame are missing or stale.
         """
         try:
+            if live:
+                self._hold_attached()
             if live and frame.joints is None:
-                masked = self._mask(self._with_joints(frame, 0.0))
+                masked = self._masked_at(frame, 0.0)
                 if abs(frame.depth_delay) > _SAME_TIME_S:
-                    masked = self._mask(self._with_joints(masked, frame.depth_delay))
+                    masked = self._masked_at(masked, frame.depth_delay)
             else:
                 masked = self._mask(frame)
         except JointsUnknownError as error:
@@ -168,14 +194,61 @@ class RobotMask:
         self.masked, self.problem = self.masked + 1, None
         return masked
 
-    def _with_joints(self, frame: Frame, after: float) -> Frame:
-        """Return the frame with the joints at a time [s] after its stamp."""
+    def _masked_at(self, frame: Frame, after: float) -> Frame:
+        """Return the frame with the robot masked as it is at a time [s] after the frame's stamp."""
         delay = after + self.joint_delay
-        q = self.history.at(frame.stamp + delay, _WAIT_S + max(delay, 0.0))
-        return replace(frame, joints=q, joint_names=self.history.names)
+        stamp, wait_s = frame.stamp + delay, _WAIT_S + max(delay, 0.0)
+        come = self.history.reaches(stamp - wait_s)
+        if self._workspace.T_link_camera is None or (self._has_transforms and not come):
+            return self._mask.at_poses(frame, *self._poses(frame, stamp, wait_s))
+        q = self.history.at(stamp, wait_s)
+        return self._mask(replace(frame, joints=q, joint_names=self.history.names))
+
+    @property
+    def _has_transforms(self) -> bool:
+        return self.topics is not None and self._frames is not None and len(self.topics.transforms) > 0
+
+    def _poses(self, frame: Frame, stamp: float, wait_s: float) -> tuple[Array, Array | None]:
+        """Return the poses (J + 1, 4, 4) of the links at a stamp [s] by TF, and that of the camera.
+
+        Both are in the frame of the camera. If the workspace has the pose of the camera on its link, the poses are in
+        the frame of the base, and the second one is None.
+        """
+        if self.topics is None or self._frames is None:
+            hint = "publish joint states, and write T_link_camera to scene.yaml"
+            raise JointsUnknownError(
+                f"the links of {self.robot.name} have no known names in TF.", field="tf", hint=hint
+            )
+        fixed = self._workspace.T_link_camera is not None
+        target = self._frames.names[0] if fixed else frame.camera_frame if isinstance(frame, RosFrame) else ""
+        if not target:
+            hint = "set header.frame_id of the images, or write T_link_camera to scene.yaml"
+            raise JointsUnknownError("the images name no frame of their camera.", field="frame_id", hint=hint)
+        T_target_frame = self.topics.transforms.poses(target, self._frames.names, stamp, wait_s)
+        T = T_target_frame @ self._frames.T_frame_link
+        self._check_model(T)
+        return T, None if fixed else np.eye(4)
+
+    def _check_model(self, T: Array) -> None:
+        """Check that links at poses (J + 1, 4, 4) are where a joint of the model can move them.
+
+        Raises:
+            JointsUnknownError: a link is more than 2 cm away, or the axis of its joint is tilted.
+        """
+        assert self._frames is not None
+        for k, joint in enumerate(self.robot.joints):
+            moved = inverse(T[k] @ joint.T_before_joint) @ T[k + 1]
+            away = float(np.linalg.norm(moved[: 2 if joint.prismatic else 3, 3]))
+            if away > REACH or moved[2, 2] < np.cos(_TILT):
+                name, tilt = self._frames.names[k + 1], float(np.arccos(np.clip(moved[2, 2], -1.0, 1.0)))
+                raise JointsUnknownError(
+                    f"{name} in TF is {100 * away:.1f} cm and {tilt:.2f} rad from the model of {self.robot.name}.",
+                    field="tf",
+                    hint="name the robot that publishes TF, or publish its joint states",
+                )
 
     def hold(self, spheres: ArrayLike) -> None:
-        """Mask an object in the hand from the next frame on.
+        """Mask an object in the hand from the next frame on, in addition to the attached ones of MoveIt.
 
         Args:
             spheres: (A, 4) spheres (x, y, z, radius) [m] in the frame of the last link, at most 64; none to release.
@@ -186,7 +259,61 @@ class RobotMask:
         held = np.asarray(spheres, np.float64).reshape(-1, 4)
         if len(held) > MAX_HELD:
             raise InputError(f"has {len(held)} spheres.", field="spheres", hint=f"give at most {MAX_HELD}")
-        self._mask = self_mask(self.robot, self._workspace, held=held)
+        with self._building:
+            before, self._given = self._given, held
+            try:
+                self._build()
+            except InputError:
+                self._given = before
+                raise
+            self._version = -1  # the attached objects share the number of spheres
+
+    def _build(self) -> None:
+        self._mask = self_mask(
+            self.robot,
+            self._workspace,
+            held=np.concatenate([self._given, self._attached]),
+            needs_camera=not self._camera_in_tf,
+        )
+
+    def _hold_attached(self) -> None:
+        """Mask the objects that are attached now to the last link, or to a frame that it carries.
+
+        Raises:
+            JointsUnknownError: the link of an object is not known, or there are too many shapes.
+        """
+        if self.topics is None or self.topics.attached.version == self._version:
+            return
+        with self._building:
+            version = self.topics.attached.version
+            solids = [
+                (T_last_link, solid)
+                for name, one in self.topics.attached.objects.items()
+                if (T_last_link := self._on_last_link(name, one.link)) is not None
+                for solid in one.solids
+            ]
+            left = MAX_HELD - len(self._given)
+            if len(solids) > left:
+                hint = f"attach at most {MAX_HELD}, with those that a client holds"
+                raise JointsUnknownError(f"{len(solids)} attached shapes are too many.", field="attached", hint=hint)
+            covers = [(T, solid.spheres(left // len(solids))) for T, solid in solids]
+            moved = [np.c_[transform_points(T, spheres[:, :3]), spheres[:, 3]] for T, spheres in covers]
+            self._attached = np.concatenate([np.zeros((0, 4)), *moved])
+            self._build()
+            self._version = version
+
+    def _on_last_link(self, name: str, link: str) -> Array | None:
+        """Return T_last_link (4, 4) of a link that the last link carries; None if another link carries it."""
+        assert self.topics is not None
+        transforms, frames = self.topics.transforms, self._frames
+        if frames is not None and (carrier := transforms.carrier(link, frames.names)) is not None:
+            if carrier != frames.names[-1]:
+                return None
+            T_frame_link = transforms.newest(carrier, link)
+            assert T_frame_link is not None  # the carrier is above the link
+            return inverse(frames.T_frame_link[-1]) @ T_frame_link
+        hint = "publish its TF, or attach the object to the last link"
+        raise JointsUnknownError(f"the link {link} of attached {name[:40]!r} is not known.", field="tf", hint=hint)
 
     def _refuse(self, error: JointsUnknownError) -> None:
         self.refused, self.problem = self.refused + 1, error.message

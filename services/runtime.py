@@ -24,12 +24,16 @@ from splatbot.services.metrics import Metrics
 from splatbot.services.plans import Plans
 from splatbot.services.pushed import PushedFrames, StreamEndedError
 from splatbot.services.robot_mask import MaskedSource, RobotMask
+from splatbot.services.ros.robot_topics import RobotTopics
 from splatbot.services.scratch import sweep_scratch
 from splatbot.services.settings import ServiceSettings
 from splatbot.services.steady_camera import SteadyCamera
 from splatbot.services.store import MapExistsError, MapStore, ServedMap
-from splatbot.services.topics import JOINTS, JointState, robot_topic
+from splatbot.services.threads import join_started
+from splatbot.services.topics import JOINTS, ROS_ROBOT, JointState, robot_topic
 from splatbot.workspace import Workspace
+
+_WAITING_NEWS = 2000  # messages of TF: 2 s of a robot at 1 kHz
 
 _log = logging.getLogger(__name__)
 
@@ -66,7 +70,8 @@ class Runtime:
         self.config = config or Config()
         self.robot = None if settings.robot is None else known_robot(settings.robot)
         self.workspace = None if settings.scene is None else Workspace.load(settings.scene)
-        self._mask_of_topics = None if self.workspace is None else self.new_mask(self.workspace)
+        self._robot_topics = RobotTopics()
+        self._mask_of_topics = self._new_mask_of_topics()
         self.library = MapLibrary(settings.data_dir) if settings.data_dir is not None else None
         if self.library is not None:
             self.library.lock()
@@ -84,6 +89,8 @@ class Runtime:
         self._started = False
         self._lock = threading.Lock()
         self._disk = threading.Lock()  # a map is either saved or deleted
+        self._robot_news = self.bus.subscribe(ROS_ROBOT, capacity=_WAITING_NEWS, latched=False)
+        self._robot_listener = threading.Thread(target=self._take_robot_news, name="robot", daemon=True)
         self._ended = threading.Event()
         self._keeper = threading.Thread(target=self._keep, name="keeper", daemon=True)
         # A thread has the priority of the one that starts it, and those that answer have a lower one.
@@ -93,6 +100,7 @@ class Runtime:
     def start(self) -> None:
         """Serve the saved maps, start saving, and start to map the sources that are followed."""
         sweep_scratch()
+        self._robot_listener.start()
         if self.library is not None:
             self.library.load_all(self.store)
             self._keeper.start()
@@ -134,6 +142,8 @@ class Runtime:
         served = self.store.add(
             map_id, source="pushed frames", state="mapping", workspace=workspace, mask=mask, awaited=False
         )
+        if mask is not None:
+            mask.topics = self._robot_topics
         frames = PushedFrames(self.settings.max_waiting_frames, mask)
         mapping = LiveMapping(
             self.store,
@@ -172,9 +182,8 @@ class Runtime:
             InputError: the frame does not fit those before, or the map is made of something else.
         """
         with suppress(MapExistsError):
-            mask = self._mask_of_topics or self.new_mask(self.workspace)
-            self.open_stream(map_id, workspace=self.workspace, mask=mask)
-            self._mask_of_topics = self.new_mask(self.workspace)  # of the next map of that name
+            self.open_stream(map_id, workspace=self.workspace, mask=self._mask_of_topics)
+            self._mask_of_topics = self._new_mask_of_topics()  # of the next map of that name
         if self.robot is not None and self.store.get(map_id).mask is None:
             hint = f"delete it: the robot in frames of ROS topics is masked in a map {map_id!r} of its own"
             raise InputError(f"map {map_id!r} masks no robot.", field="map", hint=hint)
@@ -186,7 +195,13 @@ class Runtime:
         Raises:
             InputError: the pose of the camera is unknown, or the workspace does not fit the robot.
         """
-        return None if self.robot is None else RobotMask(self.robot, workspace)
+        return None if self.robot is None else RobotMask(self.robot, workspace, self._robot_topics)
+
+    def _new_mask_of_topics(self) -> RobotMask | None:
+        """Return a mask for a camera of ROS topics, whose pose may be in TF."""
+        if self.robot is None:
+            return None
+        return RobotMask(self.robot, self.workspace, self._robot_topics, camera_in_tf=True)
 
     def report_joints(self, robot: str, state: JointState) -> int:
         """Publish a robot's joints, and keep them for the frames of each map in which it is masked.
@@ -210,6 +225,16 @@ class Runtime:
         if problem is not None and not kept:
             raise problem
         return kept
+
+    def _take_robot_news(self) -> None:
+        for news in self._robot_news:
+            topic, message = news.value
+            try:
+                self._robot_topics.take(topic, message)
+            except SplatbotError as error:
+                _log.warning("%s from a client: %s", topic, error)
+            except Exception:  # one odd message must not end the others
+                _log.exception("%s from a client could not be used", topic)
 
     def make(self, served: ServedMap, work: Work, **more: Any) -> Job:
         """Queue the job that makes a map; deleting the map cancels it.
@@ -277,6 +302,7 @@ class Runtime:
             self._save_all()
             if self.library is not None:
                 self.library.unlock()
+        join_started([self._robot_listener], self._time_left())
         self.metrics.close()
 
     def _time_left(self) -> float:

@@ -12,15 +12,18 @@
 | ``jobs/{id}`` | :class:`splatbot.services.jobs.Job`: each change of a job |
 | ``motions/{id}`` | :class:`splatbot.protocols.Feedback`: feedback of an arm that follows a trajectory |
 | ``robot/{name}/joints`` | :class:`JointState`: the robot's latest joints |
+| ``ros/robot`` | topic and message of TF or MoveIt that a ROS client has published |
 | ``arms/{name}/joints`` | :class:`JointState`: those of one of the service's arms |
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+
+from splatbot.frame import Frame
 
 STATE = "state"
 REMOVED = "removed"
@@ -30,6 +33,7 @@ TRAJECTORY = "trajectory"
 PLAN = "plan"
 GRASPS = "grasps"
 JOINTS = "joints"
+ROS_ROBOT = "ros/robot"
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +51,17 @@ class JointState:
     names: tuple[str, ...]
     position: NDArray[np.float64]
     velocity: NDArray[np.float64] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class RosFrame(Frame):
+    """A frame of a ROS camera.
+
+    Args:
+        camera_frame: name of the optical frame of the camera in TF.
+    """
+
+    camera_frame: str = field(default="", kw_only=True)
 
 
 def map_topic(map_id: str, kind: str) -> str:

@@ -7,6 +7,7 @@ from functools import partial
 from typing import Any
 
 from splatbot.frame import Frame
+from splatbot.logs.ros_types import Message
 from splatbot.services.arms import Arms
 from splatbot.services.ros.emergency import EmergencyStopTopic
 from splatbot.services.ros.follow import FollowJointTrajectory
@@ -19,7 +20,7 @@ from splatbot.services.ros.rosapi import RosApi
 from splatbot.services.ros.subscribers import MAX_PIXELS, RosSubscribers
 from splatbot.services.ros.tf_republisher import TfRepublisher
 from splatbot.services.store import MapStore
-from splatbot.services.topics import JOINTS, JointState, robot_topic
+from splatbot.services.topics import JOINTS, ROS_ROBOT, JointState, robot_topic
 
 
 class RosNode:
@@ -54,10 +55,14 @@ class RosNode:
             EmergencyStopTopic(self.graph, arms)
         publish = partial(store.bus.publish, robot_topic(robot, JOINTS))
         take_joints = publish if on_joints is None else partial(on_joints, robot)
+
+        def publish_robot(topic: str, message: Message) -> None:
+            store.bus.publish(ROS_ROBOT, (topic, message), keep=False)
+
         self._parts: list[TfRepublisher | RosPublishers | RosSubscribers | FollowJointTrajectory] = [
             TfRepublisher(self.graph),
             RosPublishers(store.bus, self.graph),
-            RosSubscribers(self.graph, take_joints, on_frame=on_frame, max_pixels=max_pixels),
+            RosSubscribers(self.graph, take_joints, publish_robot, on_frame=on_frame, max_pixels=max_pixels),
         ]
         if follow is not None:
             self._parts.append(follow)

@@ -1,4 +1,4 @@
-"""Frames and joints that clients publish as ROS messages."""
+"""Frames, joints, transforms and attached objects that clients publish as ROS messages."""
 
 from __future__ import annotations
 
@@ -14,25 +14,28 @@ from splatbot.frame import Frame
 from splatbot.logs.index import MAX_STAMP_DIFFERENCE_S
 from splatbot.logs.mcap import COLOR, DEPTH, INFO, JOINTS
 from splatbot.logs.ros_frames import camera_of, color_of, depth_of, seconds_of, size_of
+from splatbot.logs.ros_types import Message
 from splatbot.logs.undistort import Undistorter
 from splatbot.services.bus import Subscription
 from splatbot.services.problems import BusyError, TooLargeError
 from splatbot.services.ros.graph import RosGraph
 from splatbot.services.ros.messages import joints_of
+from splatbot.services.ros.moveit_types import register_moveit_types
 from splatbot.services.ros.publishers import FROM_ROS
+from splatbot.services.ros.robot_topics import TYPES_OF_ROBOT
 from splatbot.services.ros.wire import RosMessage
 from splatbot.services.threads import join_started
-from splatbot.services.topics import JointState
+from splatbot.services.topics import JointState, RosFrame
 
 MAX_PIXELS = 2_100_000  # of an image, unless the settings of the service say otherwise
 _WAITING = 16
-_WAITING_STATES = 2000  # 2 s of a robot at 1 kHz, while an image is decoded
+_WAITING_STATES = 2000  # 2 s of a robot at 1 kHz, while an image is decoded; also of its transforms
 
 _log = logging.getLogger(__name__)
 
 
 class RosSubscribers:
-    """Two threads: one builds frames from clients' images, the other takes joint states, which come more often.
+    """Three threads: one builds frames from clients' images, the others take joint states, and TF with MoveIt's topics.
 
     A frame is a colour image, the depth image nearest in time (within 0.02 s) and the latest CameraInfo. Unusable
     messages are logged, which also reaches /rosout.
@@ -40,6 +43,7 @@ class RosSubscribers:
     Args:
         graph: where clients publish.
         on_joints: called with the joints of /joint_states.
+        on_robot: called with the topic and each message of TF and of attached objects.
         on_frame: called with each frame. If None, images are only forwarded to other clients.
         max_pixels: of an image.
     """
@@ -48,20 +52,25 @@ class RosSubscribers:
         self,
         graph: RosGraph,
         on_joints: Callable[[JointState], Any],
+        on_robot: Callable[[str, Message], Any],
         *,
         on_frame: Callable[[Frame], Any] | None = None,
         max_pixels: int = MAX_PIXELS,
     ) -> None:
-        self._on_joints, self._on_frame = on_joints, on_frame
+        self._on_joints, self._on_robot, self._on_frame = on_joints, on_robot, on_frame
         self.dropped = 0
         self._pairs = FramePairs(max_pixels)
+        register_moveit_types()
+        for topic, kind in TYPES_OF_ROBOT.items():
+            graph.advertise(topic, kind)
         self._news = (
             graph.subscribe(COLOR, DEPTH, INFO, capacity=_WAITING),
             graph.subscribe(JOINTS, capacity=_WAITING_STATES),
+            graph.subscribe(*TYPES_OF_ROBOT, capacity=_WAITING_STATES),
         )
         self._threads = [
             threading.Thread(target=self._run, args=(news,), name=f"ros-{name}", daemon=True)
-            for news, name in zip(self._news, ("images", "joints"), strict=True)
+            for news, name in zip(self._news, ("images", "joints", "robot"), strict=True)
         ]
 
     def start(self) -> None:
@@ -92,6 +101,8 @@ class RosSubscribers:
     def _take(self, topic: str, value: RosMessage) -> None:
         if topic == JOINTS:
             self._on_joints(joints_of(value.message))
+        elif topic in TYPES_OF_ROBOT:
+            self._on_robot(topic, value.message)
         elif self._on_frame is not None and (frame := self._pairs.add(topic, value.message)) is not None:
             self._on_frame(frame)
 
@@ -152,4 +163,7 @@ class FramePairs:
             rgb, z, camera = self._undistort.color(rgb), self._undistort.depth(z), self._undistort.camera
         self._count += 1
         delay = seconds_of(depth.header.stamp) - stamp
-        return Frame(stamp, rgb, z, camera, self._count - 1, source=FROM_ROS, depth_delay=delay)
+        frame_id = color.header.frame_id.strip("/")
+        return RosFrame(
+            stamp, rgb, z, camera, self._count - 1, source=FROM_ROS, depth_delay=delay, camera_frame=frame_id
+        )

@@ -15,10 +15,11 @@ from splatbot.errors import ConfigError, SplatbotError
 from splatbot.logs.mcap import COLOR, DEPTH, INFO, JOINTS
 from splatbot.logs.ros_types import from_cdr, full_name, typestore
 from splatbot.services.ros.graph import RosGraph
+from splatbot.services.ros.robot_topics import TYPES_OF_ROBOT
 from splatbot.services.ros.wire import RosMessage
 from splatbot.services.threads import join_started
 
-HEARD = (COLOR, DEPTH, INFO, JOINTS)  # of the topics that others publish
+HEARD = (COLOR, DEPTH, INFO, JOINTS, *TYPES_OF_ROBOT)  # of the topics that others publish
 _CLIENT = -1  # identity in the graph
 _NODE, _WAITING = "splatbot", 256
 _VOLATILE, _LATCHED = "::,10:,:,:,,", ":1:,1:,:,:,,"  # quality of service: differences from ROS' defaults
@@ -67,11 +68,15 @@ class ZenohBridge:
     def start(self) -> None:
         """Begin; topics that are latched by now go out at once."""
         import zenoh
+        from zenoh import ext
 
         self._token("NN", "")
+        latched = ext.HistoryConfig(detect_late_publishers=True)  # /tf_static comes once
         for topic in HEARD:
             key = f"{self._domain}{topic}/*/*"
-            self._session.declare_subscriber(key, self._hear, allowed_origin=zenoh.Locality.REMOTE)
+            ext.declare_advanced_subscriber(
+                self._session, key, self._hear, history=latched, allowed_origin=zenoh.Locality.REMOTE
+            )
         for topic in self._graph.topics:
             if (known := self._graph.latched(topic)) is not None:
                 self._forward(topic, known)

@@ -33,7 +33,8 @@ class SelfMask:
 
     Args:
         robot: joints, links and the spheres that cover them.
-        T_link_camera: (4, 4), the camera on the link that carries it.
+        T_link_camera: (4, 4), the camera on the link that carries it. If None, only poses of links that include the
+            camera's mask a frame; see :meth:`at_poses`.
         link: index of the link that carries the camera. -1 is the last one; 0 is the base, for a static camera.
         opening: opening of the gripper [m]. If None, the gripper is fully open.
         reach: enlargement of the spheres [m].
@@ -49,7 +50,7 @@ class SelfMask:
     def __init__(
         self,
         robot: RobotKinematics,
-        T_link_camera: ArrayLike,
+        T_link_camera: ArrayLike | None,
         *,
         link: int = -1,
         opening: float | None = None,
@@ -63,8 +64,8 @@ class SelfMask:
             raise InputError(f"is {link}.", field="link", hint=f"{robot.name} has links 0..{links - 1}")
         if not 0.0 <= reach < np.inf:
             raise InputError(f"is {reach}.", field="reach", hint="give metres, 0 or more")
-        T = np.asarray(T_link_camera, dtype=np.float64)
-        if T.shape != (4, 4) or not np.isfinite(T).all() or np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > 1e-6:
+        T = None if T_link_camera is None else np.asarray(T_link_camera, dtype=np.float64)
+        if T is not None and not _is_rigid(T):
             raise InputError(
                 "is no rigid pose.", field="T_link_camera", hint="give (4, 4) with an orthonormal rotation"
             )
@@ -103,12 +104,40 @@ class SelfMask:
             q = select_joints(frame.joint_names, frame.joints, self._names) + self._offsets
         except InputError as error:
             raise JointsUnknownError(error.message, file=where, field=error.field, hint=error.hint) from error
-        T_base_camera = self._arm.forward(q)[0, self._link] @ self._T_link_camera
-        centers = transform_points(inverse(T_base_camera), self._arm.centers(q)[0])
+        return self._seen(frame, self._arm.forward(q)[0], None)
+
+    def at_poses(self, frame: Frame, T_link: ArrayLike, T_camera: ArrayLike | None = None) -> Frame:
+        """Return the frame with the robot at given poses removed from its mask.
+
+        Args:
+            frame: the frame; its joints do not count.
+            T_link: (J + 1, 4, 4) poses of the links in any frame.
+            T_camera: (4, 4) pose of the camera in the same frame. If None, it is that on its link.
+
+        Raises:
+            JointsUnknownError: the pose of the camera is not given, and not known on its link.
+        """
+        free = self._seen(frame, np.asarray(T_link, np.float64), T_camera)
+        return replace(frame, mask=free if frame.mask is None else frame.mask & free)
+
+    def _seen(self, frame: Frame, T_link: Array, T_camera: ArrayLike | None) -> NDArray[np.bool_]:
+        """Compute the pixels (H, W) that do not show the robot at poses (J + 1, 4, 4) of its links."""
+        if T_camera is None and self._T_link_camera is None:
+            hint = "write T_link_camera to scene.yaml, or publish TF of the camera's frame"
+            raise JointsUnknownError("the pose of the camera is not known.", field="T_link_camera", hint=hint)
+        T = T_link[self._link] @ self._T_link_camera if T_camera is None else np.asarray(T_camera, np.float64)
+        at = T_link[self._arm.spheres.link]
+        centers = np.einsum("sij,sj->si", at[:, :3, :3], self._arm.spheres.centers) + at[:, :3, 3]
+        centers = transform_points(inverse(T), centers)
         hidden = np.zeros(frame.depth.shape, np.bool_)
         for center, radius in zip(centers, self._radii, strict=True):
             _hide(hidden, frame.depth, frame.camera, center, float(radius))
         return ~hidden
+
+
+def _is_rigid(T: Array) -> bool:
+    rotation = T[:3, :3] if T.shape == (4, 4) and np.isfinite(T).all() else np.zeros((3, 3))
+    return bool(np.abs(rotation @ rotation.T - np.eye(3)).max() <= 1e-6)
 
 
 def _hide(hidden: NDArray[np.bool_], depth: NDArray[np.float32], camera: Camera, center: Array, radius: float) -> None:

@@ -10,10 +10,18 @@ import numpy as np
 import pytest
 
 from splatbot.errors import InputError
+from splatbot.frame import Frame
+from splatbot.geometry import inverse, rotation_to_quat
+from splatbot.logs.ros_types import build
 from splatbot.mapping.selfmask import JointsUnknownError, SelfMask
+from splatbot.protocols import Array
 from splatbot.robots.panda import panda
+from splatbot.robots.store import load_robot
 from splatbot.services.robot_mask import JointHistory, MaskedSource, RobotMask
-from splatbot.services.topics import JointState
+from splatbot.services.ros.moveit_types import ATTACHED_TYPE, register_moveit_types
+from splatbot.services.ros.robot_topics import RobotTopics
+from splatbot.services.ros.tf_buffer import StampedTransform
+from splatbot.services.topics import JointState, RosFrame
 from splatbot.workspace import Workspace
 from tests.swept_arm import T_BASE_STATIC_CAMERA, static_log, sweep
 
@@ -150,3 +158,165 @@ def test_a_camera_whose_place_is_unknown_is_refused_at_once() -> None:
         RobotMask(panda(), SCENE).hold(np.ones((65, 4)))
     with pytest.raises(InputError, match="radius"):
         RobotMask(panda(), SCENE).hold([[0.0, 0.0, 0.1, -1.0]])
+
+
+register_moveit_types()
+LINKS = tuple(f"panda_link{k}" for k in range(8))
+
+
+def stamped(parent: str, child: str, stamp: float, T: Array, *, static: bool = False) -> StampedTransform:
+    return StampedTransform(parent, child, stamp, T[:3, 3].tolist(), rotation_to_quat(T[:3, :3]).tolist(), static)
+
+
+def publish_arm(topics: RobotTopics, stamps: Array, *, delay: float = 0.0, prefix: str = "") -> None:
+    """Add the transforms of the sweeping arm, each link in the one before it, as its driver publishes them."""
+    for t, q in zip(stamps, sweep(stamps), strict=True):
+        T = panda().fk(q)
+        topics.transforms.add(
+            stamped(prefix + LINKS[k], prefix + LINKS[k + 1], t + delay, inverse(T[k]) @ T[k + 1]) for k in range(7)
+        )
+
+
+def with_camera(topics: RobotTopics, base: str = "panda_link0") -> None:
+    """Add the camera in the frame of a table, which the base stands on."""
+    T_table_base = np.eye(4)
+    T_table_base[:3, 3] = 0.3, -0.2, 0.1
+    topics.transforms.add(
+        [
+            stamped("table", base, 0.0, T_table_base, static=True),
+            stamped("table", "optical", 0.0, T_table_base @ T_BASE_STATIC_CAMERA, static=True),
+        ]
+    )
+
+
+def from_ros(frame: Frame, camera_frame: str = "optical") -> RosFrame:
+    return RosFrame(frame.stamp, frame.rgb, frame.depth, frame.camera, frame.index, camera_frame=camera_frame)
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.3])
+@pytest.mark.parametrize("prefix", ["", "left_"])
+def test_a_frame_is_masked_by_tf_alone_with_delay_and_prefix(delay: float, prefix: str) -> None:
+    log, topics = static_log(2.0), RobotTopics()
+    names = tuple(prefix + name for name in panda().chain.names)
+    mask = RobotMask(panda(), Workspace(joint_delay=delay, joint_names=names), topics, camera_in_tf=True)
+    publish_arm(topics, np.arange(0.0, 2.5, 0.02), delay=delay, prefix=prefix)
+    with_camera(topics, f"{prefix}panda_link0")
+    found, expected = mask(from_ros(log[4])), SelfMask(panda(), T_BASE_STATIC_CAMERA, link=0).usable(log[4])
+    assert found.mask is not None
+    assert (found.mask != expected).mean() < 2e-3
+    assert 0.01 < 1.0 - expected.mean() < 0.9
+    assert (mask.masked, mask.refused, mask.problem) == (1, 0, None)
+
+
+def test_a_known_place_of_the_camera_needs_no_frame_of_it_and_depth_is_masked_at_its_own_time() -> None:
+    log, topics = static_log(2.0), RobotTopics()
+    mask = RobotMask(panda(), SCENE, topics)
+    publish_arm(topics, np.arange(0.0, 2.5, 0.02))
+    plain = SelfMask(panda(), T_BASE_STATIC_CAMERA, link=0)
+    live = mask(replace(log[2], joints=None, depth_delay=0.4))
+    later = replace(log[2], joints=sweep(np.array([log[2].stamp + 0.4]))[0])
+    assert live.mask is not None
+    assert (live.mask != (plain.usable(log[2]) & plain.usable(later))).mean() < 2e-3
+
+
+def test_joint_states_count_where_they_come_and_tf_where_they_have_stopped() -> None:
+    log, topics = static_log(2.0), RobotTopics()
+    mask = RobotMask(panda(), SCENE, topics)
+    publish_arm(topics, np.arange(-0.1, 2.5, 0.02))
+    still = SelfMask(panda(), T_BASE_STATIC_CAMERA, link=0).usable(replace(log[0], joints=sweep(np.array([0.0]))[0]))
+    for t in np.arange(-0.1, 1.1, 0.02):  # of an arm at rest
+        mask.history.add(JointState(t, panda().chain.names, sweep(np.array([0.0]))[0]))
+    by_joints = mask(replace(log[4], depth=log[0].depth, joints=None))
+    assert by_joints.mask is not None
+    np.testing.assert_array_equal(by_joints.mask, still)
+    by_tf = mask(replace(log[8], joints=None))
+    assert by_tf.mask is not None
+    plain = SelfMask(panda(), T_BASE_STATIC_CAMERA, link=0)
+    assert (by_tf.mask != plain.usable(log[8])).mean() < 2e-3
+
+
+def test_a_frame_is_refused_where_tf_is_missing_stale_or_not_connected() -> None:
+    log, topics = static_log(2.0), RobotTopics()
+    mask = RobotMask(panda(), None, topics, camera_in_tf=True)
+
+    def refused(match: str, camera_frame: str = "optical") -> None:
+        before = mask.refused
+        with pytest.raises(JointsUnknownError, match=match):
+            mask(from_ros(log[2], camera_frame))
+        assert mask.refused == before + 1
+        assert mask.problem is not None
+
+    refused("no frame optical, panda_link0")
+    publish_arm(topics, np.arange(0.0, 0.3, 0.02))
+    refused("no frame optical")
+    with_camera(topics, "another")
+    refused("does not connect panda_link0, .* with optical")
+    with_camera(topics)
+    refused("TF of panda_link1 at 0.400 s is missing or stale")
+    publish_arm(topics, np.arange(0.3, 0.5, 0.02))
+    refused("name no frame", "")
+    assert mask(from_ros(log[2])).mask is not None
+    assert (mask.masked, mask.problem) == (1, None)
+
+
+def test_links_that_do_not_fit_the_model_are_refused() -> None:
+    log, topics = static_log(2.0), RobotTopics()
+    mask = RobotMask(panda(), None, topics, camera_in_tf=True)
+    publish_arm(topics, np.arange(0.0, 1.0, 0.02))
+    with_camera(topics)
+    longer = np.eye(4)
+    longer[1, 3] = 0.1
+    topics.transforms.add([stamped("panda_link3", "panda_link4", 0.0, longer, static=True)])
+    with pytest.raises(JointsUnknownError, match=r"panda_link4 in TF is .* from the model of panda"):
+        mask(from_ros(log[2]))
+    added = RobotMask(replace(load_robot("panda"), name="mine"), None, topics, camera_in_tf=True)
+    with pytest.raises(JointsUnknownError, match="links of mine have no known names"):
+        added(from_ros(log[2]))
+
+
+def attach(topics: RobotTopics, link: str, *, name: str = "box", size: float = 0.3, operation: int = 0) -> None:
+    solid = {"type": 1, "dimensions": [size] * 3}
+    values = {"id": name, "operation": operation, "primitives": [solid], "primitive_poses": [{"position": {"z": 0.2}}]}
+    topics.attached.take_object(build(ATTACHED_TYPE, link_name=link, object=values))
+
+
+def test_attached_objects_are_masked_on_the_link_that_carries_them_until_they_are_removed() -> None:
+    log, topics = static_log(2.0), RobotTopics()
+    mask, plain = RobotMask(panda(), SCENE, topics), SelfMask(panda(), T_BASE_STATIC_CAMERA, link=0)
+    bare = plain.usable(log[2])
+    below = np.eye(4)
+    below[2, 3] = 0.107
+    attach(topics, "panda_hand")
+    with pytest.raises(JointsUnknownError, match="link panda_hand of attached 'box' is not known"):
+        mask(log[2])
+    topics.transforms.add([stamped("panda_link7", "panda_hand", 0.0, below, static=True)])
+    found = mask(log[2]).mask
+    whole = SelfMask(panda(), T_BASE_STATIC_CAMERA, link=0, held=[[0.0, 0.0, 0.307, 0.15]]).usable(log[2])
+    assert found is not None
+    assert not (found & ~whole).any()  # the sphere in the box is masked
+    assert (bare & ~found).mean() > 0.005
+    attach(topics, "panda_hand", operation=1)
+    released = mask(log[2]).mask
+    assert released is not None
+    np.testing.assert_array_equal(released, bare)
+    topics.transforms.add([stamped("panda_link4", "sensor", 0.0, below, static=True)])
+    attach(topics, "sensor")
+    assert mask(log[2]).mask is not None
+
+
+def test_what_a_client_holds_and_what_is_attached_are_masked_together_within_one_number() -> None:
+    log, topics = static_log(2.0), RobotTopics()
+    mask = RobotMask(panda(), SCENE, topics)
+    attach(topics, "panda_link7")
+    boxed = mask(log[2]).mask
+    mask.hold([[0.0, 0.0, 0.0, 0.3]] * 60)
+    both = mask(log[2]).mask
+    assert boxed is not None
+    assert both is not None
+    assert not (both & ~boxed).all()
+    for k in range(4):
+        attach(topics, "panda_link7", name=f"box{k}")
+    with pytest.raises(JointsUnknownError, match="5 attached shapes are too many"):
+        mask(log[2])
+    mask.hold([])
+    assert mask(log[2]).mask is not None

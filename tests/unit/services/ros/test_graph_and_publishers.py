@@ -29,9 +29,10 @@ from splatbot.services.ros.messages import (
     waypoints_of,
 )
 from splatbot.services.ros.publishers import FROM_ROS, ODOMETRY, POINTS, ROSOUT, TF, RosPublishers
+from splatbot.services.ros.robot_topics import TYPES_OF_ROBOT
 from splatbot.services.ros.subscribers import FramePairs, RosSubscribers
 from splatbot.services.store import MapStore
-from splatbot.services.topics import FRAME, RESULT, JointState, arm_topic, map_topic, robot_topic
+from splatbot.services.topics import FRAME, RESULT, JointState, RosFrame, arm_topic, map_topic, robot_topic
 from splatbot.slam import FrameResult
 from tests.conftest import MakeLog
 from tests.models import random_model
@@ -151,7 +152,8 @@ def test_nobody_pays_for_messages_that_nobody_reads(told: tuple[MapStore, RosGra
 def test_images_of_a_client_become_frames_and_joint_states_are_taken(make_log: MakeLog) -> None:
     graph, states = RosGraph(), list[JointState]()
     frames: list[Frame] = []
-    inlets = RosSubscribers(graph, states.append, on_frame=frames.append)
+    heard: list[str] = []
+    inlets = RosSubscribers(graph, states.append, lambda topic, _: heard.append(topic), on_frame=frames.append)
     inlets.start()
     log = open_log(make_log())
     for frame in log:
@@ -164,7 +166,12 @@ def test_images_of_a_client_become_frames_and_joint_states_are_taken(make_log: M
     graph.publish(JOINTS, build("sensor_msgs/msg/JointState", name=["a", "b"], position=[0.5, 1.0]), client=1)
     graph.publish(JOINTS, build("sensor_msgs/msg/JointState", name=["a", "b"], position=[0.5]), client=1)
     state: JointState = _until(lambda: states[0] if states else None)
+    graph.publish(TF, build(TYPES_OF_ROBOT[TF]))  # the service's own
+    for topic, kind in TYPES_OF_ROBOT.items():
+        graph.publish(topic, build(kind), client=1)
+    _until(lambda: len(heard) == len(TYPES_OF_ROBOT) or None)
     inlets.stop()
+    assert heard == list(TYPES_OF_ROBOT)
     assert len(states) == 1
     assert (state.names, state.position.tolist()) == (("a", "b"), [0.5, 1.0])
     assert [f.stamp for f in frames] == pytest.approx([f.stamp for f in log], abs=1e-9)
@@ -172,6 +179,8 @@ def test_images_of_a_client_become_frames_and_joint_states_are_taken(make_log: M
         np.testing.assert_array_equal(a.rgb, b.rgb)
         np.testing.assert_array_equal(a.depth, b.depth)
         assert (b.camera, b.source) == (a.camera, FROM_ROS)
+        assert isinstance(b, RosFrame)
+        assert b.camera_frame == "camera"
 
 
 def test_images_without_a_partner_or_intrinsics_wait_and_are_forgotten_in_the_end(make_log: MakeLog) -> None:
