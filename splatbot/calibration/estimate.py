@@ -39,4 +39,5 @@ class Estimate:
         """
         if sigma <= largest_sigma:
             return cls(value, sigma, unit)
-        return cls(value, sigma, unit, f"its standard deviation is {sigma:.2g} {unit}: {need}")
+        deviation = f"{sigma:.2g} {unit}".rstrip()
+        return cls(value, sigma, unit, f"its standard deviation is {deviation}: {need}")

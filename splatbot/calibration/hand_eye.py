@@ -6,6 +6,9 @@ frame in the base. With the pose F_k of the link and the measured pose C_k of th
 
     F(q_k + δ) X = Y C_k.
 
+Lengths of the board or the map may be wrong by one scale s: C_k then holds true lengths divided by s. Motions of the
+link that shift the camera determine s, because the arm measures in metres.
+
 The closed form of Park and Martin (1994) gives the start. Least squares over all views follow, on reprojection errors
 of a board or on errors of tracked poses, with Huber's loss. Weak priors hold joint offsets that the motion does not
 determine; their standard deviation shows it.
@@ -14,7 +17,7 @@ determine; their standard deviation shows it.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,10 +43,14 @@ class HandEyeConstants:
     """Standard deviation [rad or m] of the prior of a joint offset. Recorded arms err by up to 17 mrad."""
     delay_prior: float = 1.0
     """Standard deviation [s] of the prior of the time offset, around the one of the cross-correlation."""
-    offset_gain: float = 0.9
-    """Largest held-out error with joint offsets, as a share [1] of that without, for which they are estimated."""
+    scale_prior: float = 1.0
+    """Standard deviation [1] of the prior of the logarithm of the scale of board or map."""
+    gain: float = 0.9
+    """Largest held-out error with joint offsets or a scale, as a share [1] of that without, that takes them."""
     largest_offset_sigma: float = 0.005
     """Largest standard deviation [rad or m] of a useful joint offset: that of a person's own adjustment."""
+    largest_scale_sigma: float = 0.005
+    """Largest standard deviation [1] of a useful scale: a ruler measures a board of 0.2 m to 1 mm."""
     largest_delay_sigma: float = 0.005
     """Largest standard deviation [s] of a useful time offset."""
     largest_pose_sigma: tuple[float, float] = (0.02, 0.035)
@@ -73,6 +80,17 @@ MIN_VIEWS = 6
 _LOSS: dict[str, Any] = {"loss": "huber", "f_scale": CONSTANTS.huber, "x_scale": "jac", "max_nfev": CONSTANTS.steps}
 
 
+class HandEyeUnknowns(NamedTuple):
+    """Unknowns in addition to the two poses: whether joint offsets and a scale are among them."""
+
+    offsets: bool
+    scale: bool
+
+    def __str__(self) -> str:
+        names = [name for name, taken in (("joint offsets", self.offsets), ("scale", self.scale)) if taken]
+        return f"with {' and '.join(names)}" if names else "without joint offsets"
+
+
 @dataclass(frozen=True, eq=False)
 class HandEyeCalibration:
     """Estimated poses, offsets and their standard deviations.
@@ -83,10 +101,11 @@ class HandEyeCalibration:
         covariance_moving, covariance_static: (6, 6) of the twists (translation [m], rotation [rad]) of both, along the
             axes of the moving and of the static frame.
         offsets: offset of each joint [rad or m], to be added to its measured position; empty if none is estimated.
+        scale: true lengths of the board or map, divided by those that are given [1]; None if it is taken to be 1.
         delay: time offset [s]: the link was at the pose of a view this time after the view's stamp.
         error: median error over all views in ``unit``.
         largest_error: largest error of a useful calibration.
-        held_out: median error of held-out views without joint offsets and, if they are estimated, with them.
+        held_out: median error of held-out views for each model that was compared.
         unit: unit of the errors.
         views: number of views.
     """
@@ -96,10 +115,11 @@ class HandEyeCalibration:
     covariance_moving: Array
     covariance_static: Array
     offsets: dict[str, Estimate]
+    scale: Estimate | None
     delay: Estimate | None
     error: float
     largest_error: float
-    held_out: tuple[float, ...]
+    held_out: dict[HandEyeUnknowns, float]
     unit: str
     views: int
 
@@ -144,58 +164,84 @@ class HandEyeCalibration:
 
 
 def calibrate_hand_eye(
-    motion: LinkMotion, measured: Measurement, *, offsets: bool | None = None, delay: float | None = None
+    motion: LinkMotion,
+    measured: Measurement,
+    *,
+    offsets: bool | None = None,
+    scale: bool | None = False,
+    delay: float | None = None,
 ) -> HandEyeCalibration:
-    """Estimate the poses X and Y, and optionally joint offsets and a time offset.
+    """Estimate the poses X and Y, and optionally joint offsets, the scale of the board or map, and a time offset.
 
-    Every third view is held out to compare the models with and without joint offsets. All views give the result.
+    Every third view is held out to compare the models. All views give the result.
 
     Args:
         motion: poses of the link, one for each view.
         measured: measured poses, one for each view.
         offsets: whether joint offsets are estimated. If None, they are if this lowers the held-out error by a tenth.
+        scale: whether the scale is estimated; None as for ``offsets``. A scale that the views do not determine is 1.
         delay: time offset [s] that the stamps of the motion already lack; a correction is estimated. If None, both have
             one clock.
 
     Raises:
-        InputError: there are fewer than 6 views, or the link turns about one axis only.
+        InputError: there are fewer than 6 views, the link turns about one axis only, or ``scale`` is True and not
+            determined.
     """
     if len(motion) < MIN_VIEWS:
         raise InputError(f"has {len(motion)} usable views.", field="views", hint=f"give {MIN_VIEWS} or more")
     # The first joint turns the base, the last one the hand: see UNKNOWABLE.
-    free, refused = motion.offsets[1:-1] if offsets is not False else (), dict[str, Estimate]()
-    held_out = [_held_out_error(motion, measured, (), delay)]
-    if free:
-        held_out.append(_held_out_error(motion, measured, free, delay))
-        if offsets is None and held_out[1] > CONSTANTS.offset_gain * held_out[0]:
-            free = ()
+    joints = motion.offsets[1:-1] if offsets is not False else ()
+    compared = [HandEyeUnknowns(o, s) for o in (False, True)[: 1 + bool(joints)] for s in _allowed(scale)]
+    held_out = {m: _held_out_error(motion, measured, joints if m.offsets else (), m.scale, delay) for m in compared}
+    chosen, *others = [m for m in compared if m.offsets in _allowed(offsets if joints else False)]
+    for other in others:
+        if held_out[other] <= CONSTANTS.gain * held_out[chosen]:
+            chosen = other
+    free, scaled = joints if chosen.offsets else (), chosen.scale
+    refused, refused_scale = dict[str, Estimate](), None
     while True:
-        model = _Model(motion, measured, free, delay)
-        found = model.result(model.solve(), tuple(held_out), refused)
-        weak = {name: e for name, e in found.offsets.items() if name in free and e.refusal}
-        if not weak:
+        model = _Model(motion, measured, free, scaled, delay)
+        found = model.result(model.solve(), held_out, refused, refused_scale)
+        # Unknowns may trade off: without the least certain one, the others may be determined.
+        weak = {name: e.sigma / CONSTANTS.largest_offset_sigma for name, e in found.offsets.items() if e.refusal}
+        least = max((name for name in free if name in weak), key=weak.__getitem__, default="")
+        if scaled and found.scale is not None and found.scale.refusal:
+            if scale:
+                hint = "shift the camera more between the views, or measure the lengths and leave the scale out"
+                raise InputError(f"is not determined: {found.scale.refusal}.", field="scale", hint=hint)
+            if found.scale.sigma / CONSTANTS.largest_scale_sigma > weak.get(least, 0.0):
+                refused_scale, scaled = found.scale, False
+                continue
+        if not least:
             return found
-        # Offsets may trade off: without the least certain one, the others may be determined.
-        least = max(weak, key=lambda name: weak[name].sigma)
-        refused[least] = weak[least]
+        refused[least] = found.offsets[least]
         free = tuple(name for name in free if name != least)
 
 
-def _held_out_error(motion: LinkMotion, measured: Measurement, free: tuple[str, ...], delay: float | None) -> float:
+def _allowed(wanted: bool | None) -> tuple[bool, ...]:
+    """Return whether an unknown may be left out or taken."""
+    return (False, True) if wanted is None else (wanted,)
+
+
+def _held_out_error(
+    motion: LinkMotion, measured: Measurement, free: tuple[str, ...], scaled: bool, delay: float | None
+) -> float:
     """Return the median error of every third block of views of a fit to the others."""
     rows = np.arange(len(motion))
     blocks = np.array_split(rows, min(len(rows), CONSTANTS.blocks))
     out = np.isin(rows, np.concatenate(blocks[:: CONSTANTS.held_out_every]))
-    fitted = _Model(motion.select(rows[~out]), measured.select(rows[~out]), free, delay)
+    fitted = _Model(motion.select(rows[~out]), measured.select(rows[~out]), free, scaled, delay)
     solution = fitted.solve()
-    test = _Model(motion.select(rows[out]), measured.select(rows[out]), free, delay, start=(fitted.X, fitted.Y))
+    start = fitted.X, fitted.Y
+    test = _Model(motion.select(rows[out]), measured.select(rows[out]), free, scaled, delay, start=start)
     return test.measured.error(test.measured.residuals(test.predict(solution)))
 
 
 class _Model:
     """Least squares of one set of views.
 
-    The unknowns x are the twists of X and Y around their start, the joint offsets and the time offset.
+    The unknowns x are the twists of X and Y around their start, the joint offsets, the logarithm of the scale, and the
+    time offset.
     """
 
     def __init__(
@@ -203,22 +249,30 @@ class _Model:
         motion: LinkMotion,
         measured: Measurement,
         names: tuple[str, ...],
+        scaled: bool,
         delay: float | None,
         start: tuple[Array, Array] | None = None,
     ) -> None:
-        self.motion, self.measured, self.delay = motion, measured, delay
+        self.motion, self.measured, self.scaled, self.delay = motion, measured, scaled, delay
         self.names, self.joints = names, [motion.offsets.index(name) for name in names]
         F = motion.poses(np.zeros(len(motion.offsets)), 0.0)
         self.X, self.Y = closed_form(F, measured.start) if start is None else start
         sigmas = [CONSTANTS.pose_prior] * 12 + [CONSTANTS.offset_prior] * len(self.names)
-        self.prior = 1.0 / np.array(sigmas + [CONSTANTS.delay_prior] * (delay is not None))
+        sigmas += [CONSTANTS.scale_prior] * scaled + [CONSTANTS.delay_prior] * (delay is not None)
+        self.prior = 1.0 / np.array(sigmas)
+
+    def scale(self, x: Array) -> float:
+        """Compute the scale [1] of the board or map."""
+        return float(np.exp(x[12 + len(self.names)])) if self.scaled else 1.0
 
     def predict(self, x: Array) -> Array:
-        """Compute the poses Y⁻¹ F X (V, 4, 4)."""
+        """Compute the poses Y⁻¹ F X (V, 4, 4) in the lengths of the board or map."""
         offsets = np.zeros(len(self.motion.offsets))
         offsets[self.joints] = x[12 : 12 + len(self.names)]
         F = self.motion.poses(offsets, 0.0 if self.delay is None else float(x[-1]))
-        return np.asarray(inverse(self.Y @ se3_exp(x[6:12])) @ F @ (self.X @ se3_exp(x[:6])))
+        T = np.asarray(inverse(self.Y @ se3_exp(x[6:12])) @ F @ (self.X @ se3_exp(x[:6])))
+        T[:, :3, 3] /= self.scale(x)
+        return T
 
     def solve(self) -> Array:
         """Return the solution; the standard deviations of the measurement follow its errors."""
@@ -243,7 +297,8 @@ class _Model:
         K σ² Kᵀ with K = H⁻¹ H_kc adds the effect of their unknown values (Schmidt-Kalman).
         """
         sizes = [len(r) for r in self.measured.residuals(self.predict(x))]
-        wide = _Model(self.motion, self.measured, (*self.names, *considered), self.delay, start=(self.X, self.Y))
+        names, start = (*self.names, *considered), (self.X, self.Y)
+        wide = _Model(self.motion, self.measured, names, self.scaled, self.delay, start=start)
         split = 12 + len(self.names)
         added = np.arange(split, split + len(considered))
         found = least_squares(wide._residuals, np.insert(x, split, np.zeros(len(considered))), max_nfev=1)
@@ -266,8 +321,14 @@ class _Model:
         jackknife = (len(blocks) - 1) / len(blocks) * np.transpose(steps) @ np.array(steps)
         return np.asarray(_inverse(H) + jackknife + K @ K.T)
 
-    def result(self, x: Array, held_out: tuple[float, ...], refused: dict[str, Estimate]) -> HandEyeCalibration:
-        """Return the calibration of a solution; ``refused`` offsets are 0 in it."""
+    def result(
+        self,
+        x: Array,
+        held_out: dict[HandEyeUnknowns, float],
+        refused: dict[str, Estimate],
+        refused_scale: Estimate | None,
+    ) -> HandEyeCalibration:
+        """Return the calibration of a solution; ``refused`` offsets are 0 in it, and a refused scale is 1."""
         covariance = self.covariance(x, tuple(refused))
         sigma = np.sqrt(np.diag(covariance))
         need = "move the other joints more, or this one with the camera close to the target"
@@ -284,7 +345,10 @@ class _Model:
             ]
             every = {first: ends[0], **offsets, **refused, last: ends[1]}
             offsets = {name: every[name] for name in self.motion.offsets}
-        delay = None
+        scale, delay = refused_scale, None
+        if self.scaled:
+            s, need = self.scale(x), "shift the camera more, in all directions"
+            scale = Estimate.limited(s, s * float(sigma[12 + len(self.names)]), "", CONSTANTS.largest_scale_sigma, need)
         if self.delay is not None:
             need = "move faster and in all directions"
             value = self.delay + float(x[-1])
@@ -295,6 +359,7 @@ class _Model:
             covariance[:6, :6],
             covariance[6:12, 6:12],
             offsets,
+            scale,
             delay,
             self.measured.error(self.measured.residuals(self.predict(x))),
             self.measured.largest_error,

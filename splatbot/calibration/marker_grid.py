@@ -1,7 +1,7 @@
 """Grids of square markers: Kalibr's AprilTag grid, and OpenCV's ArUco grid board.
 
-OpenCV finds the markers. Their corners are then the intersections of lines that are fitted to the edges, because a
-corner alone is rounded by the blur of the image, and the squares between Kalibr's tags touch it.
+OpenCV finds the markers. Their corners are then the intersections of lines that are fitted to the edges. A corner alone
+is rounded by the blur of the image, and the squares between Kalibr's tags touch it.
 """
 
 from __future__ import annotations

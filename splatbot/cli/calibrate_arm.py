@@ -91,6 +91,7 @@ def calibrate_hand_eye_command(
     eye_to_hand: bool = False,
     link: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
     offsets: Literal["auto", "yes", "no"] = "auto",
+    scale: Literal["auto", "yes", "no"] | None = None,
     same_clock: bool = False,
     max_views: int = _MAX_VIEWS,
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
@@ -106,7 +107,8 @@ def calibrate_hand_eye_command(
     pose files of one motion do as well.
 
     Every third view is held out. Offsets of joints are estimated if this lowers the error of the held-out views by a
-    tenth. A value that the motion does not determine is refused with its reason.
+    tenth. So is the scale of a board, which may be printed too large or too small. A value that the motion does not
+    determine is refused with its reason.
 
     Examples:
         splatbot calibrate hand-eye images --board charuco:10x14:0.07:0.04 --robot panda --out scene.yaml
@@ -123,6 +125,8 @@ def calibrate_hand_eye_command(
         eye_to_hand: the camera is static and the board is on the arm.
         link: link that carries the camera or the board; by default the last one, -1.
         offsets: whether offsets of joints are estimated.
+        scale: whether the true lengths of the board or map, divided by the given ones, are estimated. By default auto
+            with a board and no without.
         same_clock: the stamps of both recordings agree; no time offset is estimated.
         max_views: largest number of images that are used, evenly spread.
         out: scene.yaml to write; the fields of an existing one that this command estimates are replaced.
@@ -143,7 +147,8 @@ def calibrate_hand_eye_command(
         raise InputError(f"is {link}.", field="--link", hint=f"{robot} has links 1..{len(arm.chain)} that move")
     if link == 0:
         raise InputError("is the base, which does not move.", field="--link", hint="give 1, 2, ..., or -1: the last")
-    wanted = {"auto": None, "yes": True, "no": False}[offsets]
+    choices = {"auto": None, "yes": True, "no": False}
+    wanted = choices[offsets]
     if wanted and arm is None:
         raise InputError("needs the arm's joints.", field="--offsets", hint="give --robot NAME with its joints")
     motion: LinkMotion
@@ -164,10 +169,15 @@ def calibrate_hand_eye_command(
         raise InputError("is not known without a robot.", field="--link", hint=hint)
     with steps(quiet) as show:
         show("least squares")
-        found = calibrate_hand_eye(motion, measured, offsets=wanted, delay=delay)
+        found = calibrate_hand_eye(
+            motion, measured, offsets=wanted, scale=choices[scale or ("no" if board is None else "auto")], delay=delay
+        )
     if not quiet:
         _print(found, source, eye_to_hand, board is not None)
     found.check(moving=not eye_to_hand, static=eye_to_hand or board is None)
+    if out is not None and board is None and found.scale is not None and not found.scale.refusal:
+        hint = f"divide the depth_scale of the camera file by {found.scale.value:.4f} and map the log again"
+        raise InputError("is not 1, so that the map's lengths are wrong.", file=source, field="scale", hint=hint)
     if out is not None:
         _completed(scene, found, 0 if eye_to_hand else carrier, arm, tracked=board is None).save(out)
         _announce(out, quiet)
@@ -316,11 +326,12 @@ def _print(found: HandEyeCalibration, source: str, eye_to_hand: bool, board: boo
     rows = _pose_rows(moving, found.T_link_moving, found.covariance_moving)
     rows += _pose_rows(static, found.T_base_static, found.covariance_static)
     rows += [(name, describe(estimate)) for name, estimate in found.offsets.items()]
+    if found.scale is not None:
+        rows.append((f"scale of the {'board' if board else 'map'}", describe(found.scale)))
     if found.delay is not None:
         rows.append(("time offset", describe(found.delay)))
     rows.append(("error", f"{found.error:.2f} {found.unit} median, {found.views} views"))
-    names = ("without joint offsets", "with joint offsets")
-    held_out = ", ".join(f"{e:.2f} {found.unit} {n}" for e, n in zip(found.held_out, names, strict=False))
+    held_out = ", ".join(f"{error:.2f} {found.unit} {unknowns}" for unknowns, error in found.held_out.items())
     rows.append(("held-out views", f"{held_out} (median of every third view)"))
     print_table(rows, title=f"{source}: hand-eye")
 

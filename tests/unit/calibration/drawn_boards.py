@@ -23,8 +23,10 @@ KALIBR_CODES = (
 
 
 def kalibr_tag(number: int) -> Bits:
-    """Return a tag (10, 10) as kalibr_create_target_pdf paints it, True where it is white: bit 6 i + j of the code is
-    row i and column j, turned by 180 degrees, in a border of two bits."""
+    """Return a tag (10, 10) as kalibr_create_target_pdf paints it, True where it is white.
+
+    Bit 6 i + j of the code is row i and column j. They are turned by 180 degrees, in a border of two bits.
+    """
     code = KALIBR_CODES[number]
     bits = np.array([[code >> (6 * i + j) & 1 for j in range(6)] for i in range(6)], bool)
     return np.pad(np.rot90(bits, 2), 2)
@@ -93,7 +95,7 @@ def photograph(
     noise: float = 2.0,
     seed: int = 0,
 ) -> NDArray[np.uint8]:
-    """Photograph a drawing with a lens of 0.7 px blur, and with noise.
+    """Return a photograph of a drawing with a lens of 0.7 px blur, and with noise.
 
     Args:
         drawing: the sheet.

@@ -15,9 +15,11 @@ from splatbot.calibration.board import CharucoBoard
 from splatbot.calibration.views import ViewSource
 from splatbot.config import Config, load_config, with_sensor
 from splatbot.errors import ConfigError, FormatError
+from splatbot.geometry import se3_exp
 from splatbot.logs import open_log, record
 from splatbot.logs.calibration import read_calibration
 from splatbot.logs.images import read_color
+from splatbot.trajectory import Trajectory
 from splatbot.workspace import Workspace
 from tests.conftest import MakeLog
 from tests.unit.cli.conftest import RunCommand
@@ -97,6 +99,37 @@ def test_recorded_poses_of_the_hand_do_without_a_robot(run: RunCommand, data_roo
     answer = run("calibrate", "hand-eye", data_root / "panda_charuco_32", "--board", BOARD)
     assert answer.code == 0
     assert "joint" not in answer.out.replace("without joint offsets", "")
+
+
+def test_a_board_that_is_described_too_small_keeps_the_camera_at_its_place(
+    run: RunCommand, tmp_path: Path, data_root: Path
+) -> None:
+    """Squares of 70 mm are given as 68 mm: 70 / 68 = 1.0294."""
+    words = ("--board", "charuco:10x14:0.068:0.039", "--robot", "panda")
+    answer = run("calibrate", "hand-eye", data_root / "panda_charuco_32", *words, "--out", tmp_path / "scene.yaml")
+    assert answer.code == 0
+    found = re.search(r"scale of the board +(\S+) ± (\S+)", answer.out)
+    assert found is not None
+    assert float(found[1]) == pytest.approx(70 / 68, abs=3 * float(found[2]))
+    written = Workspace.load(tmp_path / "scene.yaml")
+    assert written.T_link_camera is not None
+    assert np.linalg.norm(written.T_link_camera[:3, 3]) == pytest.approx(0.139, abs=0.003)
+
+
+def test_a_map_of_another_scale_is_no_scene(run: RunCommand, tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    links = np.array([se3_exp([*rng.uniform(-0.4, 0.4, 3), *rng.uniform(-0.6, 0.6, 3)]) for _ in range(60)])
+    cameras = links @ se3_exp([0.05, 0.02, 0.08, 0.1, -0.2, 1.5])
+    cameras[:, :3, 3] *= 1.05
+    stamps = np.arange(60.0)
+    for name, T in (("arm.txt", links), ("map.txt", cameras)):
+        Trajectory(stamps, T).save(tmp_path / name)
+    words = ("--poses", tmp_path / "arm.txt", "--link", "-1", "--scale", "auto", "--out", tmp_path / "scene.yaml")
+    answer = run("calibrate", "hand-eye", tmp_path / "map.txt", *words)
+    assert answer.code == 2
+    assert re.search(r"scale of the map +0\.952\d", answer.out)  # 1 / 1.05
+    assert "divide the depth_scale of the camera file by 0.952" in answer.err
+    assert not (tmp_path / "scene.yaml").exists()
 
 
 def test_two_pose_files_of_one_motion_give_the_hand_eye_pose_and_the_time_offset(
