@@ -211,8 +211,8 @@ class RobotMask:
     def _poses(self, frame: Frame, stamp: float, wait_s: float) -> tuple[Array, Array | None]:
         """Return the poses (J + 1, 4, 4) of the links at a stamp [s] by TF, and that of the camera.
 
-        Both are in the frame of the camera. If the workspace has the pose of the camera on its link, the poses are in
-        the frame of the base, and the second one is None.
+        Both are in the frame of the camera. If the workspace has the camera's pose on its link, the first are in the
+        frame of the base, and the second is None.
         """
         if self.topics is None or self._frames is None:
             hint = "publish joint states, and write T_link_camera to scene.yaml"

@@ -20,6 +20,7 @@ from splatbot.services.ros.node import RosNode
 from splatbot.services.ros.publishers import POINTS
 from splatbot.services.ros.zenoh_bridge import ZenohBridge
 from splatbot.services.store import MapStore
+from splatbot.services.topics import ROS_ROBOT
 from tests.contracts.conftest import wall
 from tests.waiting import until
 
@@ -149,3 +150,26 @@ def test_a_router_that_is_not_there_is_waited_for_and_a_malformed_one_is_refused
     bridge.stop()
     with pytest.raises(ConfigError, match="zenoh_router"):
         ZenohBridge(node.graph, "nonsense")
+
+
+def test_a_static_transform_of_before_the_start_is_heard(router: tuple[str, Any]) -> None:
+    """robot_state_publisher sends /tf_static once, when it starts."""
+    from zenoh import ext
+
+    kind = "tf2_msgs/msg/TFMessage"
+    key = f"7/tf_static/tf2_msgs::msg::dds_::TFMessage_/{typestore().hash_rihs01(kind)}"
+    publisher = ext.declare_advanced_publisher(router[1], key, cache=ext.CacheConfig(1), publisher_detection=True)
+    mount = {"header": {"frame_id": "hand"}, "child_frame_id": "camera", "transform": {"rotation": {"w": 1.0}}}
+    publisher.put(to_cdr(build(kind, transforms=[mount])))
+    store = MapStore()
+    news = store.bus.subscribe(ROS_ROBOT, capacity=4)
+    node = RosNode(store)
+    node.start()
+    bridge = ZenohBridge(node.graph, router[0], domain=7)
+    bridge.start()
+    message = news.get(30.0)
+    bridge.stop()
+    node.stop()
+    assert message is not None
+    topic, heard = message.value
+    assert (topic, heard.transforms[0].child_frame_id) == ("/tf_static", "camera")
