@@ -23,6 +23,7 @@ LogKind = Literal[
 ]
 
 REPLAY, OAK, REALSENSE = "replay:", "oak://", "realsense://"
+ORBBEC, OPENCV = "orbbec://", "opencv://"
 """Beginnings of the addresses of cameras, which splatbot.robots.cameras opens."""
 
 MAP_NAME = "map.ply"
@@ -87,7 +88,7 @@ _FOREIGN_MAPS = {
 
 def is_camera(uri: str) -> bool:
     """Return whether a URI names a camera, not a recording."""
-    return uri.startswith((REPLAY, OAK, REALSENSE))
+    return uri.startswith((REPLAY, OAK, REALSENSE, ORBBEC, OPENCV))
 
 
 def log_kind(uri: str | Path) -> LogKind:

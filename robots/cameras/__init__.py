@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from splatbot.errors import InputError
-from splatbot.layouts import OAK, REALSENSE, REPLAY
+from splatbot.layouts import OAK, OPENCV, ORBBEC, REALSENSE, REPLAY
 from splatbot.protocols import FrameSource
 from splatbot.robots.cameras.oak import OakCamera
+from splatbot.robots.cameras.opencv import OpenCvCamera
+from splatbot.robots.cameras.orbbec import OrbbecCamera
 from splatbot.robots.cameras.realsense import RealsenseCamera
 from splatbot.robots.cameras.replay import ReplayCamera
 
-__all__ = ["OakCamera", "RealsenseCamera", "ReplayCamera", "open_camera"]
+__all__ = ["OakCamera", "OpenCvCamera", "OrbbecCamera", "RealsenseCamera", "ReplayCamera", "open_camera"]
 
 
 def open_camera(uri: str, *, joint_delay: float = 0.0) -> FrameSource:
@@ -28,5 +30,9 @@ def open_camera(uri: str, *, joint_delay: float = 0.0) -> FrameSource:
         return OakCamera.from_uri(uri)
     if uri.startswith(REALSENSE):
         return RealsenseCamera.from_uri(uri)
-    hint = f"name one as in {OAK}, {REALSENSE} or {REPLAY}recordings/desk"
+    if uri.startswith(ORBBEC):
+        return OrbbecCamera.from_uri(uri)
+    if uri.startswith(OPENCV):
+        return OpenCvCamera.from_uri(uri)
+    hint = f"name one as in {OAK}, {REALSENSE}, {ORBBEC}, {OPENCV}0?camera=FILE or {REPLAY}recordings/desk"
     raise InputError(f"{uri!r} is unknown.", field="camera", hint=hint)
