@@ -20,11 +20,15 @@ LogKind = Literal[
     "lerobot",
     "realsense",
     "rig",
+    "colmap",
 ]
 
 REPLAY, OAK, REALSENSE = "replay:", "oak://", "realsense://"
 ORBBEC, OPENCV = "orbbec://", "opencv://"
 """Beginnings of the addresses of cameras, which splatbot.robots.cameras opens."""
+
+COLMAP_DEPTH = ("depth", "depths")
+"""Folders of the depth images of a COLMAP scene, the preferred one first."""
 
 MAP_NAME = "map.ply"
 RECORDING = "recording.mcap"
@@ -34,13 +38,15 @@ MAP_SUFFIXES = (".ply", ".splat", ".spz", ".sog", ".glb")
 
 _SOG_NAME = "meta.json"  # of a map in a folder of WebP images
 _LAYOUTS_HINT = (
-    "known folders: rgb.txt with depth.txt (TUM), results/ with traj.txt (Replica), metadata.yaml (ROS 2), 7-Scenes, "
-    "color/ with depth/ (Open3D, ScanNet), meta/info.json (LeRobot). Known files: .mcap, .bag, .sens, .r3d, "
-    ".db3 (RealSense), .yaml (several cameras); `synthetic:tabletop` needs no files"
+    "known folders: rgb.txt with depth.txt (TUM), results/ with traj.txt (Replica), metadata.yaml (ROS 2), 7-Scenes. "
+    "More folders: color/ with depth/ (Open3D, ScanNet), meta/info.json (LeRobot), Nerfstudio or COLMAP with depth/. "
+    "Known files: .mcap, .bag, .sens, .r3d, .db3 (RealSense), .yaml (several cameras); `synthetic:tabletop` needs no "
+    "files"
 )
 _LIBREALSENSE = b"/device_0/sensor_"  # beginning of the topics of librealsense
 _FILES: dict[str, LogKind] = {".mcap": "bag", ".bag": "bag", ".sens": "scannet", ".r3d": "record3d"}
-_WITH_OPTIONS = ("bag", "lerobot", "tum")  # kinds whose path may be followed by ?KEY=VALUE&KEY=VALUE
+_WITH_OPTIONS = ("bag", "lerobot", "tum", "colmap")  # kinds whose path may be followed by ?KEY=VALUE&KEY=VALUE
+_COLMAP_MODELS = ("sparse/0", "sparse", ".", "0")  # in the folder of a scene, the preferred one first
 _HEAD = 2**20  # bytes of a JSON file that hold its description, or its first frames
 _AS_TUM = "write rgb/, depth/ (16-bit PNG), rgb.txt, depth.txt and intrinsics.json (docs/guide/mapping.md)"
 _FROM_A_LOG = f"map a recording; splatbot reads files of Gaussians ({', '.join(MAP_SUFFIXES)})"
@@ -134,7 +140,16 @@ def _kind(path: Path) -> LogKind | None:
         return "7scenes"
     if (path / "color").is_dir() and (path / "depth").is_dir():
         return "images"
-    return "transforms" if _names(path / "transforms.json", b'"depth_file_path"') else None
+    if _names(path / "transforms.json", b'"depth_file_path"'):
+        return "transforms"
+    has_depth = (path / "images").is_dir() and any((path / name).is_dir() for name in COLMAP_DEPTH)
+    return "colmap" if has_depth and colmap_model(path) is not None else None
+
+
+def colmap_model(folder: Path) -> Path | None:
+    """Return the folder of the first COLMAP model of a scene, or None."""
+    places = [folder / name for name in _COLMAP_MODELS]
+    return next((place for place in places if any((place / f"cameras{s}").is_file() for s in (".bin", ".txt"))), None)
 
 
 def _names(file: Path, key: bytes) -> bool:
@@ -202,7 +217,7 @@ def _foreign_folder(folder: Path) -> tuple[str, str]:
             f"train a map from its images: splatbot train {folder}",
         )
     if any((folder / name).exists() for name in ("sparse", "database.db", "cameras.bin", "cameras.txt")):
-        return "is a COLMAP scene, which has no depth", f"train a map from its images: splatbot train {folder}"
+        return "is a COLMAP scene, which has no folder depth", f"train a map from its images: splatbot train {folder}"
     if any(folder.glob("*.db3")) or any(folder.glob("*.mcap")):
         return "holds a rosbag2 without metadata.yaml", "run `ros2 bag reindex`, or name the .mcap file itself"
     inside = sorted(path.name for path in folder.iterdir() if log_layout(path)) if folder.is_dir() else []

@@ -10,6 +10,8 @@ from splatbot.layouts import LogKind, log_kind
 from splatbot.logs.address import PAIR_WITHIN, split_address
 from splatbot.logs.base import Log
 from splatbot.logs.calibration import Calibration
+from splatbot.logs.colmap import OPTIONS as COLMAP_OPTIONS
+from splatbot.logs.colmap import ColmapLog
 from splatbot.logs.image_folder import ImageFolderLog
 from splatbot.logs.record import record
 from splatbot.logs.record3d import Record3dLog
@@ -70,6 +72,9 @@ def open_log(
         return _open_bag(str(uri), camera, joint_delay)
     if kind == "lerobot":
         return _open_lerobot(str(uri), camera, joint_delay)
+    if kind == "colmap":
+        folder, options = split_address(str(uri), COLMAP_OPTIONS)
+        return ColmapLog(folder, camera=camera, options=options)
     if kind == "tum":
         folder, options = split_address(str(uri), (PAIR_WITHIN,))
         return TumLog(folder, camera=camera, missing=missing, joint_delay=joint_delay, options=options)

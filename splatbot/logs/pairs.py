@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -60,6 +61,28 @@ def numbered_files(folder: Path, pattern: str) -> dict[int, Path]:
         if other != path:
             raise LogError(f"has the number of {other.name}.", file=path, field="name", hint="remove one of both")
     return found
+
+
+def name_order(name: str) -> list[tuple[int, str]]:
+    """Return a key that orders names by their numbers: 2 before 10."""
+    parts = re.split(r"([0-9]+)", name)
+    return [(len(part.lstrip("0")), part.lstrip("0") or part) if i % 2 else (0, part) for i, part in enumerate(parts)]
+
+
+def stamps_of_names(folder: Path, names: Sequence[str]) -> list[float]:
+    """Return stamps [s] of images in their order: the seconds in all names, as 12.345.png, or n / 30 s.
+
+    Raises:
+        LogError: the names are seconds that do not increase.
+    """
+    found = [re.fullmatch(r"(\d{1,12}\.\d{1,9})\.[a-z]+", name, re.IGNORECASE | re.ASCII) for name in names]
+    seconds = [float(match[1]) for match in found if match is not None]
+    if len(seconds) < len(names):
+        return [n / RATE for n in range(len(names))]
+    if any(a >= b for a, b in pairwise(seconds)):
+        hint = "give each image its own time, all with as many decimals"
+        raise LogError("does not increase.", file=folder, field="seconds in names", hint=hint)
+    return seconds
 
 
 def pair_files(folder: Path, colors: dict[int, Path], depths: dict[int, Path]) -> tuple[list[ImagePair], int]:

@@ -5,7 +5,6 @@ Camera axes are those of OpenGL: x right, y up, z backwards. Principal points co
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -17,7 +16,7 @@ from splatbot.camera import Camera
 from splatbot.errors import CameraError, LogError
 from splatbot.logs.base import MILLIMETRES
 from splatbot.logs.calibration import Calibration, number, read_object
-from splatbot.logs.pairs import RATE, PairLog, pair_files
+from splatbot.logs.pairs import PairLog, name_order, pair_files, stamps_of_names
 from splatbot.logs.poses import rigid_pose
 from splatbot.logs.presets import find_calibration
 
@@ -30,7 +29,9 @@ _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
 
 
 class TransformsLog(PairLog):
-    """A Nerfstudio scene with depth; frames are ordered by the numbers in their names, at 30 per second.
+    """A Nerfstudio scene with depth; frames are ordered by the numbers in their names.
+
+    Names that are seconds, as 1305031102.175304.png, are stamps; other names give the n-th frame the stamp n / 30 s.
 
     All frames have the camera of the file: a log has one camera. Depth is in millimetres unless
     `depth_unit_scale_factor` holds another unit [m]. Frames without depth are counted in ``unpaired``.
@@ -51,7 +52,7 @@ class TransformsLog(PairLog):
         listed = values.get("frames")
         if not isinstance(listed, list) or not all(isinstance(frame, dict) for frame in listed):
             raise self._bad("frames", "is no list of objects", "write the file again")
-        frames = sorted(enumerate(listed), key=lambda entry: _order(entry[1].get("file_path")))
+        frames = sorted(enumerate(listed), key=lambda entry: name_order(str(entry[1].get("file_path"))))
         colors = {n: self._path(place, f"frames[{i}].file_path", f.get("file_path")) for n, (i, f) in enumerate(frames)}
         depths = {
             n: self._path(place, f"frames[{i}].depth_file_path", f["depth_file_path"])
@@ -61,9 +62,10 @@ class TransformsLog(PairLog):
         if len(set(colors.values())) < len(colors):
             raise self._bad("frames", "list one image twice", "remove one of both frames")
         pairs, self.unpaired = pair_files(place, colors, depths)
+        stamps = stamps_of_names(place, [path.name for path in colors.values()])
         self._matrices = [self._matrix(*frames[pair.number]) for pair in pairs]
         calibration = self._calibration(values, listed) if camera is None else find_calibration(camera)
-        super().__init__(folder, pairs, [pair.number / RATE for pair in pairs], calibration)
+        super().__init__(folder, pairs, [stamps[pair.number] for pair in pairs], calibration)
 
     def _poses(self) -> Iterable[NDArray[np.float64] | None]:
         return (rigid_pose(matrix @ _FLIP_YZ) for matrix in self._matrices)
@@ -116,9 +118,3 @@ class TransformsLog(PairLog):
 
     def _bad(self, field: str, problem: str, hint: str) -> LogError:
         return LogError(f"{problem}.", file=self._file, field=field, hint=hint)
-
-
-def _order(name: Any) -> list[tuple[int, str]]:
-    """Return a key that orders names by their numbers: 2 before 10."""
-    parts = re.split(r"([0-9]+)", str(name))
-    return [(len(part.lstrip("0")), part.lstrip("0") or part) if i % 2 else (0, part) for i, part in enumerate(parts)]

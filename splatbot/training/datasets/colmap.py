@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatbot.errors import FormatError, LogError
+from splatbot.formats.colmap import ImageRow, read_cameras, read_images, read_points
 from splatbot.geometry import inverse, pose_from_quat
+from splatbot.layouts import colmap_model
 from splatbot.training.datasets.base import TrainingData, sorted_views
-from splatbot.training.datasets.colmap_files import ImageRow, read_cameras, read_images, read_points
 from splatbot.training.datasets.images import Lens, PhotoFile, is_image, make_lens, open_photo, photo_size, scaled_size
-from splatbot.training.datasets.kind import colmap_model
 
 _NAMES = ("cameras", "images", "points3D")
 _MAX_DISTANCE = 1e9  # of a camera from the origin

@@ -5,10 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from splatbot.errors import InputError
+from splatbot.layouts import colmap_model
 from splatbot.training.datasets.base import DatasetKind
-
-MODEL_FOLDERS = ("sparse/0", "sparse", ".", "0")
-"""Places of a COLMAP model in the folder of a scene, the preferred one first."""
 
 _RUN_FILES = ("map.ply", "trajectory.tum", "config.yaml")
 _EXPECTED = (
@@ -35,9 +33,3 @@ def dataset_kind(folder: Path) -> DatasetKind:
     if all((folder / name).is_file() for name in _RUN_FILES):
         return "run"
     raise InputError("holds no dataset of a known kind.", file=folder, field="dataset", hint=_EXPECTED)
-
-
-def colmap_model(folder: Path) -> Path | None:
-    """Return the folder of the first COLMAP model of a scene, or None."""
-    places = [folder / name for name in MODEL_FOLDERS]
-    return next((place for place in places if any((place / f"cameras{s}").is_file() for s in (".bin", ".txt"))), None)

@@ -156,6 +156,42 @@ def write_record3d(folder: Path, frames: Sequence[Frame], poses: Sequence[Pose],
     return folder / "scan.r3d"
 
 
+def quaternion(R: NDArray[np.floating[Any]]) -> tuple[float, ...]:
+    """Return wxyz of a rotation, from its axis and angle by OpenCV."""
+    axis = cv2.Rodrigues(R)[0][:, 0]
+    angle = float(np.linalg.norm(axis))
+    return (np.cos(angle / 2), *(np.sin(angle / 2) / max(angle, 1e-12) * axis))
+
+
+def write_colmap(folder: Path, frames: Sequence[Frame], poses: Sequence[Pose], *, binary: bool = True) -> Path:
+    """Write a COLMAP scene with depth, by https://colmap.github.io/format.html: T_camera_world, images out of order."""
+    c = frames[0].camera
+    params = (c.fx, c.fy, c.cx + 0.5, c.cy + 0.5)
+    rows = []
+    for n, (frame, T) in enumerate(zip(frames, poses, strict=True)):
+        write(folder / f"images/frame{n:03d}.jpg", encoded(frame.rgb))  # a PNG; readers do not ask its name
+        write(folder / f"depth/frame{n:03d}.png", encoded(units(frame)))
+        inverse = np.linalg.inv(T)
+        rows.append((n + 1, quaternion(inverse[:3, :3]), tuple(inverse[:3, 3]), f"frame{n:03d}.jpg"))
+    model = folder / "sparse/0"
+    if binary:
+        data = struct.pack("<Q", len(rows))
+        for number, quat, shift, name in rows[::-1]:
+            data += struct.pack("<I4d3dI", number, *quat, *shift, 1) + name.encode() + b"\0"
+            data += struct.pack("<Q", 1) + struct.pack("<ddq", 10.0, 20.0, -1)  # one 2D point without a 3D point
+        write(model / "images.bin", data)
+        write(model / "cameras.bin", struct.pack("<QIiQQ4d", 1, 1, 1, c.width, c.height, *params))  # 1: PINHOLE
+        write(model / "points3D.bin", struct.pack("<Q", 0))
+        return folder
+    lines = [
+        f"{n} {' '.join(map(repr, map(float, (*q, *t))))} 1 {name}\n10.0 20.0 -1\n" for n, q, t, name in rows[::-1]
+    ]
+    write(model / "images.txt", "# Image list\n" + "".join(lines))
+    write(model / "cameras.txt", f"1 PINHOLE {c.width} {c.height} {' '.join(map(repr, params))}\n")
+    write(model / "points3D.txt", "# 3D point list\n")
+    return folder
+
+
 def write_nerfstudio(folder: Path, frames: Sequence[Frame], poses: Sequence[Pose]) -> Path:
     """Write a Nerfstudio scene with depth: poses in OpenGL's axes, pixel centres at +0.5, frames out of order."""
     c = frames[0].camera

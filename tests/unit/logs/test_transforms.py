@@ -48,6 +48,13 @@ def test_frames_poses_and_intrinsics_are_read_in_the_order_of_numbers(folder: Pa
     np.testing.assert_allclose(truth.T_world_camera, poses, atol=1e-9)
 
 
+def test_names_that_are_seconds_are_stamps(folder: Path) -> None:
+    for n in range(6):
+        (folder / f"images/frame_{n:05d}.png").rename(folder / f"images/{5 + 0.25 * n:.2f}.png")
+        change_frame(folder, 5 - n, file_path=f"images/{5 + 0.25 * n:.2f}.png")
+    assert [frame.stamp for frame in open_log(folder)] == [5.0, 5.25, 5.5, 5.75, 6.0, 6.25]
+
+
 def test_numbers_without_leading_zeros_are_in_their_order(folder: Path, scene: Scene) -> None:
     (folder / "images/frame_00001.png").rename(folder / "images/frame_10.png")
     change_frame(folder, 4, file_path="images/frame_10.png")
