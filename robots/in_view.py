@@ -7,7 +7,9 @@ from pathlib import Path
 from numpy.typing import ArrayLike
 
 from splatbot.errors import FormatError, InputError
+from splatbot.layouts import log_kind
 from splatbot.logs import Log, open_log
+from splatbot.logs.rig import RigLog
 from splatbot.mapping.selfmask import SelfMask
 from splatbot.protocols import RobotKinematics
 from splatbot.results.folder import RunFolder
@@ -69,6 +71,8 @@ def open_without_robot(uri: str, robot: str | None, *, camera: str | None = None
     """
     if robot is None:
         return open_log(uri, camera=camera)
+    if log_kind(uri) == "rig":  # each camera has a mount of its own
+        return RigLog(uri, lambda address, own: open_without_robot(address, robot, camera=own))
     workspace = find_workspace(uri)
     mask = self_mask(load_robot(robot), workspace, file=f"{uri}/{NAME}")
     assert workspace is not None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -17,6 +17,8 @@ from splatbot.errors import InputError
 from splatbot.frame import Frame
 from splatbot.gaussians import Snapshot
 from splatbot.mapping.executor import Executor, InlineExecutor, ThreadExecutor
+from splatbot.mapping.extrinsics import MeasuredPose
+from splatbot.mapping.further_camera import FurtherCamera, MapState, make_camera
 from splatbot.mapping.joint_motion import JointMotionMonitor
 from splatbot.mapping.keyframe_choice import FrameQuality
 from splatbot.mapping.keyframes import Keyframe
@@ -46,6 +48,7 @@ class FrameResult:
         gaussians: number of Gaussians afterwards.
         skipped: tracking stages that did not fit the time budget.
         covariance: (6, 6) of the pose, see :attr:`splatbot.tracking.estimate.PoseEstimate.covariance`; None when lost.
+        camera_name: name of the camera; empty for the first one.
     """
 
     index: int
@@ -59,6 +62,7 @@ class FrameResult:
     gaussians: int = 0
     skipped: tuple[str, ...] = ()
     covariance: NDArray[np.float64] | None = None
+    camera_name: str = ""
 
 
 class Slam:
@@ -67,6 +71,9 @@ class Slam:
     By default everything runs in the calling thread in a fixed order: the same frames give the same map, bit for bit.
     With ``config.mapping.threaded`` a second thread maps while the caller's tracks; :meth:`close` or :meth:`finish`
     ends it.
+
+    The first camera defines the world; its frames have no ``camera_name``. Frames of the cameras in ``config.cameras``
+    go into the same map, see :mod:`splatbot.mapping.further_camera`.
 
     Args:
         config: If None, the defaults apply.
@@ -80,7 +87,8 @@ class Slam:
         self._location = GraphLocation()
         self._quality = FrameQuality()
         self._joint_motion = JointMotionMonitor(self.config.mapping.still_joint_speed)
-        self._image_size: tuple[int, int] | None = None
+        self._image_sizes: dict[str, tuple[int, int]] = {}
+        self._further_cameras = self._make_further_cameras()
         self._localization_only = False
         self._first: PreparedFrame | None = None
         """The first frame, until the velocity of the camera during it is known."""
@@ -91,7 +99,8 @@ class Slam:
         A frame that is held out before the map has a keyframe is lost: there is no world to localize it in.
 
         Raises:
-            InputError: The image size differs from that of earlier frames; the map is unchanged.
+            InputError: The image size differs from that of earlier frames of the camera, or the camera is unknown; the
+                map is unchanged.
         """
         clock = StageClock()
         prepared = clock.time("prepare", self._prepare, frame)
@@ -101,11 +110,17 @@ class Slam:
         keyframe = self._mapper.should_insert(observation)
         with self._location_restored_on_error():
             if keyframe:
-                self._location = self._mapper.submit(observation)
+                self._submit(observation)
             else:
                 self._mapper.observe(observation)
             self._executor.run()
         return self._record(frame, estimate, keyframe, clock)
+
+    def _submit(self, observation: Observation) -> None:
+        """Submit a keyframe; one of the first camera becomes the location of the next frame in the pose graph."""
+        location = self._mapper.submit(observation)
+        if not observation.camera_name:
+            self._location = location
 
     @contextmanager
     def _location_restored_on_error(self) -> Iterator[None]:
@@ -132,10 +147,13 @@ class Slam:
             return 0
         return self._mapper.pending_iterations + self.config.mapping.final_iterations
 
-    def localise_only(self) -> None:
+    def localise_only(self, config: Config | None = None) -> None:
         """Localize all further frames in the map, which does not change; the next frame may be anywhere in it.
 
         ``results`` starts again; the world frame remains that of the map.
+
+        Args:
+            config: configuration whose further cameras replace those of the map. If None, these remain.
 
         Raises:
             InputError: There is no map yet.
@@ -146,7 +164,9 @@ class Slam:
         with self._executor.paused():
             self._mapper.freeze()
         self._localization_only = True
-        self._image_size = None
+        self.config = config or self.config
+        self._image_sizes = {}
+        self._further_cameras = self._make_further_cameras()
         self.results = []
         self._tracker.forget()
 
@@ -160,16 +180,18 @@ class Slam:
         if not correction:
             return
         self._executor.run()
-        number, results = -1, []
+        number, results, still = -1, [], np.eye(4)
         for result in self.results:
-            number += result.keyframe
-            T, T_new_old = result.T_world_camera, correction.get(number)
-            if T is not None and T_new_old is not None:
-                result = replace(result, T_world_camera=T_new_old @ T)
+            number += result.keyframe and not result.camera_name
+            if result.T_world_camera is not None:
+                T_new_old = correction.get(self._moves_with(result.camera_name, number), still)
+                result = replace(result, T_world_camera=T_new_old @ result.T_world_camera)
             results.append(result)
         self.results = results
         if number in correction:
             self._tracker.move(correction[number])
+        for name, camera in self._further_cameras.items():
+            camera.move(correction.get(self._moves_with(name, number), still))
 
     def close(self) -> None:
         """End the mapping thread, if there is one, once all submitted keyframes are in the map."""
@@ -200,13 +222,23 @@ class Slam:
 
     @property
     def keyframes(self) -> Sequence[Keyframe]:
-        """Keyframes that frames are tracked against."""
+        """Keyframes of all cameras."""
         return self._mapper.keyframes
 
     @property
+    def further_cameras(self) -> Mapping[str, FurtherCamera]:
+        """Cameras other than the first one, by name."""
+        return self._further_cameras
+
+    @property
     def trajectory(self) -> Trajectory:
-        """Current estimates of the poses of all tracked frames."""
-        poses = [(r.stamp, r.T_world_camera) for r in self.results if r.T_world_camera is not None]
+        """Current estimates of the poses of all tracked frames of the first camera."""
+        return self.trajectory_of("")
+
+    def trajectory_of(self, camera_name: str) -> Trajectory:
+        """Return the current estimates of the poses of all tracked frames of a camera."""
+        own = [r for r in self.results if r.camera_name == camera_name]
+        poses = [(r.stamp, r.T_world_camera) for r in own if r.T_world_camera is not None]
         stamps = np.array([stamp for stamp, _ in poses], dtype=np.float64)
         return Trajectory(stamps, np.array([T for _, T in poses], dtype=np.float64).reshape(-1, 4, 4))
 
@@ -219,16 +251,22 @@ class Slam:
         return ThreadExecutor(self._mapper) if self.config.mapping.threaded else InlineExecutor(self._mapper)
 
     def _prepare(self, frame: Frame) -> PreparedFrame:
-        """Check the image size of a frame and prepare it for tracking."""
+        """Check the camera and the image size of a frame and prepare it for tracking."""
+        where, name = frame.source or f"frame {frame.index}", frame.camera_name
+        if name and name not in self._further_cameras:
+            hint = f"the further cameras are {', '.join(self._further_cameras) or 'none'}: describe it in `cameras`"
+            raise InputError(f"is {name!r:.40}.", file=where, field="camera_name", hint=hint)
         size = frame.camera.width, frame.camera.height
-        self._image_size = self._image_size or size
-        if size != self._image_size:
+        known = self._image_sizes.setdefault(name, size)
+        if size != known:
             raise InputError(
-                f"is {size[0]} x {size[1]}, earlier frames are {self._image_size[0]} x {self._image_size[1]}.",
-                file=frame.source or f"frame {frame.index}",
+                f"is {size[0]} x {size[1]}, earlier frames are {known[0]} x {known[1]}.",
+                file=where,
                 field="image size",
                 hint="map recordings of different sizes separately",
             )
+        if name:
+            return self._further_cameras[name].prepare(frame, self.config.of_camera(name), self._map_state(frame.stamp))
         return prepare(frame, self.config.tracking, self._tracker.expected_twist(frame.stamp))
 
     def _apply_loop_closure(self) -> None:
@@ -237,7 +275,9 @@ class Slam:
 
     def _track(self, prepared: PreparedFrame, hold_out: bool) -> tuple[PreparedFrame, PoseEstimate]:
         """Return the pose of a frame and the images that it belongs to, which tracking may have rectified."""
-        keyframes = self._mapper.keyframes
+        if prepared.frame.camera_name:
+            return self._track_further(prepared)
+        keyframes = self._mapper.first_keyframes
         if keyframes:
             self._tracker.variance_scale = self._mapper.inconsistency
             estimate = self._tracker.track(prepared, keyframes)
@@ -250,6 +290,34 @@ class Slam:
             return prepared, PoseEstimate(np.eye(4), "lost", ("held out before the map has begun",), "start")
         self._first = prepared
         return prepared, self._tracker.start(prepared)
+
+    def _track_further(self, prepared: PreparedFrame) -> tuple[PreparedFrame, PoseEstimate]:
+        """Return the pose of a frame of a further camera."""
+        frame = prepared.frame
+        camera, config = self._further_cameras[frame.camera_name], self.config.of_camera(frame.camera_name)
+        estimate = camera.track(prepared, config, self._map_state(frame.stamp))
+        return estimate.prepared or prepared, estimate
+
+    def _map_state(self, stamp: float) -> MapState:
+        """Return the map and the first camera at a time [s], for the further cameras."""
+        first = None
+        if not self._tracker.is_lost and self._mapper.keyframes:
+            first = MeasuredPose(*self._tracker.pose_at(stamp))
+        return MapState(
+            keyframes=self._mapper.keyframes,
+            variance_scale=self._mapper.inconsistency,
+            first=first,
+            first_twist=self._tracker.expected_twist(stamp),
+        )
+
+    def _make_further_cameras(self) -> dict[str, FurtherCamera]:
+        cameras = self.config.cameras.items()
+        return {name: make_camera(camera, self.config.of_camera(name)) for name, camera in cameras}
+
+    def _moves_with(self, camera_name: str, number: int) -> int:
+        """Return the keyframe of the first camera that a pose moves with: ``number``, or that of a fixed camera."""
+        anchor = self._further_cameras[camera_name].anchor if camera_name else None
+        return number if anchor is None else anchor
 
     def _rectified_first(self, estimate: PoseEstimate, stamp: float) -> PreparedFrame | None:
         """Return the first frame rectified by its velocity, if the second one reveals that the camera moved during it.
@@ -278,6 +346,8 @@ class Slam:
 
     def _observation(self, prepared: PreparedFrame, estimate: PoseEstimate, hold_out: bool) -> Observation:
         """Collect a tracked frame for the mapper, and note whether the robot moves."""
+        if prepared.frame.camera_name:
+            return self._further_observation(prepared, estimate, hold_out)
         self._mapper.set_robot_moving(self._joint_motion.update(prepared.frame.stamp, prepared.frame.joints))
         if estimate.verdict != "lost" and not hold_out:
             self._location = self._mapper.locate(estimate.T_world_camera, self._location)
@@ -286,6 +356,19 @@ class Slam:
             prepared, estimate.T_world_camera, features, self._location, estimate.verdict, held_out=hold_out
         )
         return replace(observation, is_poor=self._quality.is_poor(observation))
+
+    def _further_observation(self, prepared: PreparedFrame, estimate: PoseEstimate, hold_out: bool) -> Observation:
+        """Collect a frame of a further camera, which moves with a keyframe of the first camera."""
+        camera = self._further_cameras[prepared.frame.camera_name]
+        anchor = camera.anchor if camera.anchor is not None else self._location.keyframe
+        return Observation(
+            prepared,
+            estimate.T_world_camera,
+            camera.keypoints(prepared, estimate),
+            GraphLocation(anchor),
+            estimate.verdict,
+            held_out=hold_out,
+        )
 
     def _record(self, frame: Frame, estimate: PoseEstimate, keyframe: bool, clock: StageClock) -> FrameResult:
         """Append the result of a frame, and report the time outside the stages to the tracker's budget."""
@@ -303,9 +386,10 @@ class Slam:
             gaussians=self._mapper.size,
             skipped=estimate.skipped,
             covariance=None if lost else estimate.covariance,
+            camera_name=frame.camera_name,
         )
         self.results.append(result)
-        if estimate.stage_ms:
+        if estimate.stage_ms and not frame.camera_name:
             stages = clock.ms["prepare"] + sum(estimate.stage_ms.values())
             if not self.config.mapping.threaded:  # with a thread, the submission is all that tracking waits for
                 stages += mapping_ms

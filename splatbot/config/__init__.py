@@ -1,6 +1,6 @@
 """Configuration of a run: sections of settings, their layout in YAML files, and where values come from."""
 
-from splatbot.config.load import config_from_yaml, load_config, read_yaml, with_sensor
+from splatbot.config.load import config_from_yaml, load_config, read_yaml, with_cameras, with_sensor
 from splatbot.config.sections import (
     BundleConfig,
     CameraConfig,
@@ -24,5 +24,6 @@ __all__ = [
     "config_from_yaml",
     "load_config",
     "read_yaml",
+    "with_cameras",
     "with_sensor",
 ]

@@ -73,6 +73,22 @@ def with_sensor(config: Config, values: Mapping[str, Any], *, file: str | None =
     return config.model_copy(update={"sensor": sensor, "tracking": tracking})
 
 
+def with_cameras(config: Config, cameras: Mapping[str, Mapping[str, Any]], *, file: str | None = None) -> Config:
+    """Return a configuration with the further cameras of a log that it does not describe itself.
+
+    Args:
+        config: configuration.
+        cameras: values of :class:`splatbot.config.CameraConfig` by name.
+        file: file of the log, for error messages.
+
+    Raises:
+        ConfigError: a key is unknown, or a value is out of range.
+    """
+    known = {name: values for name, values in cameras.items() if name not in config.cameras}
+    added = validate({"cameras": known}, file=file).cameras
+    return config.model_copy(update={"cameras": {**config.cameras, **added}})
+
+
 def validate(values: dict[str, Any], *, file: str | Path | None = None) -> Config:
     """Return the configuration of values in the layout of :class:`Config`.
 

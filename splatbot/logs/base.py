@@ -6,7 +6,6 @@ from collections.abc import Iterator, Mapping
 from typing import Any, Protocol, cast
 
 from splatbot.camera import Camera
-from splatbot.config import CameraConfig
 from splatbot.frame import Frame
 from splatbot.logs.calibration import Calibration
 from splatbot.trajectory import Trajectory
@@ -56,8 +55,11 @@ class Log(Protocol):
         ...
 
     @property
-    def cameras(self) -> Mapping[str, CameraConfig]:
-        """Further cameras by their name, whose frames have it as ``camera_name``; empty for a single camera."""
+    def cameras(self) -> Mapping[str, Mapping[str, Any]]:
+        """Values of the section `cameras` of the configuration: further cameras, empty for a single one.
+
+        Their frames have the key as ``camera_name``.
+        """
         ...
 
     def __len__(self) -> int: ...
@@ -90,7 +92,7 @@ class LogBase:
         return Calibration(cast(Log, self).camera, MILLIMETRES)
 
     @property
-    def cameras(self) -> Mapping[str, CameraConfig]:
+    def cameras(self) -> Mapping[str, Mapping[str, Any]]:
         """No further cameras; see :class:`Log`."""
         return {}
 
@@ -153,7 +155,7 @@ class DerivedLog(LogBase):
         return self._log.calibration
 
     @property
-    def cameras(self) -> Mapping[str, CameraConfig]:
+    def cameras(self) -> Mapping[str, Mapping[str, Any]]:
         """As of the other log."""
         return self._log.cameras
 

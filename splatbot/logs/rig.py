@@ -9,11 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from pydantic import ValidationError
 
 from splatbot.camera import Camera
-from splatbot.config import CameraConfig
-from splatbot.errors import ConfigError, LogError
+from splatbot.errors import LogError
 from splatbot.frame import Frame
 from splatbot.layouts import log_kind
 from splatbot.logs.base import Log, StampedLog
@@ -61,7 +59,7 @@ class RigLog(StampedLog):
 
     Args:
         path: YAML file with the mapping ``cameras`` from names to ``log``, ``camera``, ``time_offset`` and the keys of
-            :class:`splatbot.config.CameraConfig`. Paths are relative to the file.
+            the section ``cameras`` of the configuration. Paths are relative to the file.
         opener: opens one recording.
 
     Raises:
@@ -74,7 +72,7 @@ class RigLog(StampedLog):
         self._file = Path(path)
         entries = _entries(self._file)
         self._parts = [self._part(name, values, opener) for name, values in entries.items()]
-        self._cameras = {part.name: self._config(part, entries[part.name]) for part in self._parts[1:]}
+        self._cameras = {part.name: _settings(part, entries[part.name]) for part in self._parts[1:]}
         ordered = sorted((t, k, i) for k, part in enumerate(self._parts) for i, t in enumerate(part.stamps))
         self.stamps = [stamp for stamp, _, _ in ordered]
         self._places = [(part, index) for _, part, index in ordered]
@@ -96,8 +94,8 @@ class RigLog(StampedLog):
         return self._parts[0].log.effects
 
     @property
-    def cameras(self) -> Mapping[str, CameraConfig]:
-        """Further cameras by their name, in the order of the file."""
+    def cameras(self) -> Mapping[str, Mapping[str, Any]]:
+        """Further cameras by their name, in the order of the file; see :class:`splatbot.logs.Log`."""
         return self._cameras
 
     @property
@@ -132,19 +130,6 @@ class RigLog(StampedLog):
         path, mark, options = str(local).partition("?")
         return path + mark + options if Path(path).exists() or local.exists() else address
 
-    def _config(self, part: RigCamera, values: Mapping[str, Any]) -> CameraConfig:
-        own = {key: value for key, value in values.items() if key not in _FIRST_KEYS}
-        sensor = own.get("sensor") or {}
-        if isinstance(sensor, dict):
-            own["sensor"] = {**part.log.calibration.sensor, **sensor}
-        try:
-            return CameraConfig.model_validate(own)
-        except ValidationError as error:
-            first = error.errors()[0]
-            key = ".".join(["cameras", part.name, *(str(place) for place in first["loc"])])
-            hint = f"the keys are log, camera, time_offset, {', '.join(CameraConfig.model_fields)}"
-            raise self._wrong(key, f"{first['msg']}.", hint) from error
-
     def _wrong(self, field: str, message: str, hint: str) -> LogError:
         return LogError(message, file=self._file, field=field, hint=hint)
 
@@ -171,17 +156,8 @@ def _entries(file: Path) -> dict[str, dict[str, Any]]:
     return cameras
 
 
-def check_same_cameras(log: Log, cameras: Mapping[str, CameraConfig]) -> None:
-    """Check that a log has the further cameras of a saved run.
-
-    Raises:
-        ConfigError: it has others.
-    """
-    if dict(log.cameras) != dict(cameras):
-        names = ", ".join(cameras) or "none"
-        raise ConfigError(
-            f"are not those of the run ({names}).",
-            file=log.uri,
-            field="cameras",
-            hint="restore the file of the rig, or map the log again",
-        )
+def _settings(part: RigCamera, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings of a further camera: those of the file, and the calibrated sensor of its recording."""
+    own = {key: value for key, value in values.items() if key not in _FIRST_KEYS}
+    sensor = own.get("sensor") or {}
+    return own | ({"sensor": {**part.log.calibration.sensor, **sensor}} if isinstance(sensor, dict) else {})

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from splatbot import _native
 from splatbot.camera import Camera
-from splatbot.config import MappingConfig, TrackingConfig
+from splatbot.config import Config, MappingConfig, TrackingConfig
 from splatbot.frame import Frame
 from splatbot.geometry import inverse
 from splatbot.tracking.features import Features
@@ -66,6 +66,7 @@ class Keyframe:
         static_mask: (H, W) bool, pixels that are neither masked nor show a dynamic object; elsewhere, depth is 0. If
             None, all pixels are static.
         is_poor: whether it is blurred or degraded, so that a better view of the place replaces it.
+        camera_name: name of its camera; empty for the first one.
     """
 
     number: int
@@ -77,6 +78,7 @@ class Keyframe:
     reference: Reference
     static_mask: Tensor | None = None
     is_poor: bool = False
+    camera_name: str = ""
 
     @property
     def viewmat(self) -> Tensor:
@@ -87,6 +89,15 @@ class Keyframe:
     def K(self) -> Tensor:
         """Intrinsic matrix (1, 3, 3) float64, for pixel centers at +0.5."""
         return torch.from_numpy(self.camera.K_corner)[None]
+
+
+NUMBERS = 2**20
+"""Keyframes of the k-th further camera are numbered from k times this one; those of the first camera from 0."""
+
+
+def first_number(camera_name: str, config: Config) -> int:
+    """Return the number of the first keyframe of a camera."""
+    return NUMBERS * (1 + [*config.cameras].index(camera_name)) if camera_name else 0
 
 
 def mapping_images(

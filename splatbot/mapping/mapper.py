@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import threading
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ from splatbot.mapping.depth_fusion import (
 from splatbot.mapping.dynamic_objects import DynamicObjectFilter
 from splatbot.mapping.exposure import in_exposure_of_map
 from splatbot.mapping.insertion import ModelView, guessed_gaussians, model_depth, new_gaussians, unexplained, view_of
-from splatbot.mapping.keyframes import Keyframe, is_keyframe, mapping_images, resized
+from splatbot.mapping.keyframes import Keyframe, first_number, is_keyframe, mapping_images, resized
 from splatbot.mapping.loop import LoopCloser
 from splatbot.mapping.memory import memory_of
 from splatbot.mapping.merge import merge_similar
@@ -76,6 +76,7 @@ class Mapper:
 
     1. add: the frame becomes a keyframe with its measured depth as reference; frames can be tracked against it at once.
     2. insert: depth fusion, new Gaussians, pruning, a reference with the depth of the map, loop detection.
+       Keyframes of further cameras are not in the pose graph; each moves with a keyframe of the first camera.
     3. refine: ``refine_iterations`` gradient steps, then a reference with the depth of the refined map.
 
     The list of keyframes and their references are replaced by assignment, never changed: a reader in another thread
@@ -95,16 +96,21 @@ class Mapper:
         self._refiner.adam.extend(self.model)
         self._dynamic_objects = DynamicObjectFilter(config.mapping.dynamic_timeout_s)
         self._depth_noise = DepthNoiseModel.of(config.tracking)
-        self._unmapped_seen = False
+        self._unmapped_seen: set[str] = set()
+        """Names of the cameras that see a part of the scene without a map."""
+        self._anchors: dict[int, int] = {}
+        """Number of the first camera's keyframe with which each keyframe of a further camera moves."""
         self._robot_moving = False
         self._frozen = False
         self._stamp = 0.0
         # Written by the tracking thread only.
-        self._observed_stamp = -math.inf
+        self._observed_stamps: dict[str, float] = {}
+        """Stamp [s] of the last frame of each camera that was offered for the comparison with the map."""
         # The two threads share these under the lock.
         self._lock = threading.Lock()
         self._submitted: deque[Observation] = deque()
-        self._latest: Observation | None = None
+        self._latest: dict[str, Observation] = {}
+        """The frame of each camera that is compared with the map next."""
         # Added to the keyframes, not in the map yet.
         self._added: deque[tuple[Observation, Keyframe]] = deque()
         # In the map, with a reference to renew after refinement.
@@ -116,6 +122,15 @@ class Mapper:
     def size(self) -> int:
         """Number of Gaussians."""
         return len(self.model)
+
+    @property
+    def first_keyframes(self) -> list[Keyframe]:
+        """Keyframes of the first camera, which its frames are tracked against."""
+        return self.keyframes_of("")
+
+    def keyframes_of(self, camera_name: str) -> list[Keyframe]:
+        """Return the keyframes of one camera."""
+        return [keyframe for keyframe in self.keyframes if keyframe.camera_name == camera_name]
 
     @property
     def memory(self) -> dict[str, int]:
@@ -150,7 +165,7 @@ class Mapper:
     @property
     def has_observations(self) -> bool:
         """True while submitted observations, or an observed frame, are not processed yet."""
-        return self.has_keyframes_to_insert or self._latest is not None
+        return self.has_keyframes_to_insert or bool(self._latest)
 
     @property
     def has_work(self) -> bool:
@@ -170,7 +185,7 @@ class Mapper:
             T_world_camera: (4, 4) of the frame.
             previous: location of the previous frame.
         """
-        return self.loops.locate(T_world_camera, self.keyframes, previous)
+        return self.loops.locate(T_world_camera, self.first_keyframes, previous)
 
     def should_insert(self, observation: Observation) -> bool:
         """Return whether a frame qualifies as a keyframe; changes no state.
@@ -183,33 +198,38 @@ class Mapper:
             return False
         if valid_share(observation.prepared) < self.config.tracking.min_depth_coverage:
             return False
-        waiting = self._waiting()
+        waiting, name = self._waiting(), observation.camera_name
         if len(waiting) >= CONSTANTS.backlog or self.loops.correction is not None:
             return False
-        if observation.location.revisits or (self._unmapped_seen and not waiting):
+        if observation.location.revisits or (name in self._unmapped_seen and not waiting):
             return True
         replaces = self.config.mapping.replace_poor and not observation.is_poor
         views: list[Keyframe | Observation] = [*self.keyframes, *waiting]
+        views = [view for view in views if view.camera_name == name]
         views = [view for view in views if not (replaces and view.is_poor)]
         return is_keyframe(observation.T_world_camera, views, self.config.mapping)
 
     def submit(self, observation: Observation) -> GraphLocation:
         """Queue a frame as the next keyframe; return its own location in the pose graph."""
         with self._lock:
+            name = observation.camera_name
+            before = sum(waiting.camera_name == name for waiting in self._submitted)
             self._submitted.append(observation)
-            return GraphLocation(self._next_number() + len(self._submitted) - 1)
+            return GraphLocation(self._next_number(name) + before)
 
     def observe(self, observation: Observation) -> None:
         """Offer a frame that is not a keyframe for the comparison with the map; the next one replaces it.
 
-        Only frames with the verdict "ok" count, at intervals of ``observe_interval_s``.
+        Only frames with the verdict "ok" count, at intervals of ``observe_interval_s`` for each camera.
         """
         if self._frozen or observation.held_out or observation.verdict != "ok":
             return
-        if not 0 <= observation.stamp - self._observed_stamp < self.config.mapping.observe_interval_s:
-            self._observed_stamp = observation.stamp
+        name = observation.camera_name
+        since = observation.stamp - self._observed_stamps.get(name, -math.inf)
+        if not 0 <= since < self.config.mapping.observe_interval_s:
+            self._observed_stamps[name] = observation.stamp
             with self._lock:
-                self._latest = observation
+                self._latest[name] = observation
 
     def set_robot_moving(self, moving: bool) -> None:
         """Pause refinement while the robot moves; the pending iterations run once it stops."""
@@ -231,7 +251,7 @@ class Mapper:
                 self.add_keyframe()
             elif self._added:
                 self.insert_keyframe()
-            elif self._latest is not None:
+            elif self._latest:
                 self._compare_latest()
             elif self._may_refine:
                 self.refine(iterations)
@@ -263,11 +283,13 @@ class Mapper:
     def insert_keyframe(self) -> None:
         """Insert the first added keyframe into the map, update its reference and search for loop closures."""
         observation, keyframe = self._added[0]
-        kept = without_replaced(self.keyframes, keyframe, self.config.mapping)
-        self.keyframes = without_redundant(kept, self.config.mapping.max_keyframes)
+        self._cull_keyframes(keyframe)
         self.fuse(observation, keyframe)
         self.make_reference(observation, keyframe)
-        self.loops.add(keyframe, observation, self.keyframes)
+        if observation.camera_name:
+            self._anchors = self._anchors | {keyframe.number: observation.location.keyframe or 0}
+        else:
+            self.loops.add(keyframe, observation, self.first_keyframes)
         self._added.popleft()
         if self._may_refine:
             self._inserted.append((observation, keyframe))
@@ -275,13 +297,13 @@ class Mapper:
     def fuse(self, observation: Observation, keyframe: Keyframe) -> None:
         """Update the Gaussians by a keyframe's depth and create new ones where the map does not explain it."""
         self._stamp = observation.stamp
-        self._fuse_depth(keyframe.depth, keyframe.camera, keyframe.T_world_camera)
+        self._fuse_depth(keyframe.depth, keyframe.camera, keyframe.T_world_camera, keyframe.camera_name)
         view = view_of(self.model, keyframe.camera, keyframe.T_world_camera)
         keyframe.rgb = in_exposure_of_map(keyframe.rgb, keyframe.depth, view)
         self._mask_dynamic_objects(keyframe, view)
         self._add_gaussians(keyframe, view)
         self._prune()
-        self._unmapped_seen = False
+        self._unmapped_seen = self._unmapped_seen - {keyframe.camera_name}
         self.pending_iterations += self.config.mapping.refine_iterations
         self.version += 1
 
@@ -318,10 +340,10 @@ class Mapper:
         Returns:
             ``T_new_old`` (4, 4) by keyframe number; empty without a loop closure.
         """
-        correction = self.loops.correction
-        if correction is None or self._frozen:
+        if self.loops.correction is None or self._frozen:
             return {}
-        self._latest = None  # its pose belongs to the map before the correction
+        correction = self._with_further_cameras(self.loops.correction)
+        self._latest.clear()  # their poses belong to the map before the correction
         self._inserted.clear()
         self.keyframes = [move_keyframe(keyframe, correction) for keyframe in self.keyframes]
         self.model = move_gaussians(self.model, correction)
@@ -334,7 +356,7 @@ class Mapper:
     def freeze(self) -> None:
         """Keep the map as it is from here on: no keyframes, no observations, no refinement."""
         self._frozen = True
-        self._latest = None
+        self._latest.clear()
 
     def finish(self, stop: Stop = never) -> None:
         """Refine over all keyframes at the end of a log, and densify where the loss gradients are large.
@@ -368,11 +390,25 @@ class Mapper:
         with self._lock:
             return [*self._submitted, *(observation for observation, _ in self._added)]
 
-    def _next_number(self) -> int:
-        return self.keyframes[-1].number + 1 if self.keyframes else 0
+    def _next_number(self, camera_name: str) -> int:
+        own = self.keyframes_of(camera_name)
+        return own[-1].number + 1 if own else first_number(camera_name, self.config)
+
+    def _with_further_cameras(self, correction: Mapping[int, Array]) -> dict[int, Array]:
+        """Return a correction by keyframe number with that of the keyframes of further cameras."""
+        still = np.eye(4)
+        return {**correction, **{number: correction.get(first, still) for number, first in self._anchors.items()}}
+
+    def _cull_keyframes(self, keyframe: Keyframe) -> None:
+        """Remove the keyframes of its camera that a new keyframe replaces or makes redundant."""
+        kept = without_replaced(self.keyframes_of(keyframe.camera_name), keyframe, self.config.mapping)
+        kept = without_redundant(kept, self.config.mapping.max_keyframes)
+        numbers = {k.number for k in kept}
+        name = keyframe.camera_name
+        self.keyframes = [k for k in self.keyframes if k.camera_name != name or k.number in numbers]
 
     def _state(self) -> dict[str, Any]:
-        names = ("keyframes", "model", "pending_iterations", "version", "_stamp", "_unmapped_seen")
+        names = ("keyframes", "model", "pending_iterations", "version", "_stamp", "_unmapped_seen", "_anchors")
         state = {name: getattr(self, name) for name in names} | {"_dynamic_objects": copy(self._dynamic_objects)}
         return state | {"": (self._refiner.state(), self.loops.state())}
 
@@ -387,14 +423,15 @@ class Mapper:
             self._submitted.clear()
             self._added.clear()
             self._inserted.clear()
-            self._latest = None
+            self._latest.clear()
 
     def _make_keyframe(self, observation: Observation) -> Keyframe:
         prepared, T_world_camera = observation.prepared, observation.T_world_camera
-        camera, rgb, depth = mapping_images(prepared.frame, self.config.mapping, self.config.tracking)
+        tracking = self.config.of_camera(observation.camera_name).tracking
+        camera, rgb, depth = mapping_images(prepared.frame, self.config.mapping, tracking)
         mask = prepared.frame.mask
         return Keyframe(
-            number=self._next_number(),
+            number=self._next_number(observation.camera_name),
             camera=camera,
             rgb=torch.from_numpy(np.ascontiguousarray(rgb)),
             depth=torch.from_numpy(depth),
@@ -403,12 +440,14 @@ class Mapper:
             reference=make_reference(prepared.levels, T_world_camera, self.config.tracking.n_pixels),
             static_mask=None if mask is None else torch.from_numpy(resized(mask, depth.shape)),
             is_poor=observation.is_poor,
+            camera_name=observation.camera_name,
         )
 
     def _compare_latest(self) -> None:
         with self._lock:
-            observation, self._latest = self._latest, None
-        if observation is not None:
+            names = [*self._latest][:1]
+            observations = [self._latest.pop(name) for name in names]
+        for observation in observations:
             self._compare(observation)
 
     def _compare(self, observation: Observation) -> None:
@@ -418,19 +457,25 @@ class Mapper:
         scene without a map, the next frame becomes a keyframe.
         """
         frame, T_world_camera = observation.prepared.frame, observation.T_world_camera
-        camera, rgb, measured = mapping_images(frame, self.config.mapping, self.config.tracking)
+        name = observation.camera_name
+        camera, rgb, measured = mapping_images(frame, self.config.mapping, self.config.of_camera(name).tracking)
         depth = torch.from_numpy(measured)
-        self._fuse_depth(depth, camera, T_world_camera)
+        self._fuse_depth(depth, camera, T_world_camera, name)
         self._prune()
         view = view_of(self.model, camera, T_world_camera)
         colors = in_exposure_of_map(torch.from_numpy(np.ascontiguousarray(rgb)), depth, view)
         self._dynamic_objects.find(view, colors, depth, camera, T_world_camera, self.keyframes, frame.stamp)
         unmapped = (depth > 0) & (view.alpha < self.config.mapping.unexplained_alpha)
-        self._unmapped_seen = float(unmapped.float().mean()) > CONSTANTS.unmapped_share
+        is_seen = float(unmapped.float().mean()) > CONSTANTS.unmapped_share
+        self._unmapped_seen = self._unmapped_seen | {name} if is_seen else self._unmapped_seen - {name}
         self.version += 1
 
-    def _fuse_depth(self, depth: torch.Tensor, camera: Camera, T_world_camera: Array) -> None:
-        comparison = compare_with_depth(self.model, depth, camera, T_world_camera, self._depth_noise)
+    def _noise_of(self, camera_name: str) -> DepthNoiseModel:
+        return DepthNoiseModel.of(self.config.of_camera(camera_name).tracking) if camera_name else self._depth_noise
+
+    def _fuse_depth(self, depth: torch.Tensor, camera: Camera, T_world_camera: Array, camera_name: str) -> None:
+        noise = self._noise_of(camera_name)
+        comparison = compare_with_depth(self.model, depth, camera, T_world_camera, noise)
         self.model = update_visibility(fuse_normals(fuse_depth(self.model, comparison), comparison), comparison)
 
     def _mask_dynamic_objects(self, keyframe: Keyframe, view: ModelView) -> None:
@@ -440,7 +485,7 @@ class Mapper:
             keyframe.depth,
             keyframe.camera,
             keyframe.T_world_camera,
-            [k for k in self.keyframes if k.number < keyframe.number],
+            [k for k in self.keyframes if not any(k is waiting for _, waiting in self._added)],
             self._stamp,
         )
         if dynamic.any():
@@ -451,7 +496,8 @@ class Mapper:
         measured = new_gaussians(keyframe, unexplained(view, keyframe.depth, self.config.mapping), self.config.mapping)
         guessed = guessed_gaussians(view, keyframe, self.config.mapping)
         for new in (measured, guessed):
-            new.uncertainty = initial_uncertainty(new, keyframe.T_world_camera, self._depth_noise)
+            noise = self._noise_of(keyframe.camera_name)
+            new.uncertainty = initial_uncertainty(new, keyframe.T_world_camera, noise)
         self.model = GaussianModel.concatenate([self.model, measured, guessed])
         self._refiner.adam.extend(self.model)
 

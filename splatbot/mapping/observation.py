@@ -19,7 +19,7 @@ class GraphLocation:
 
     Args:
         keyframe: number of its reference keyframe: the nearest one that the trajectory leads to. If None, the map has
-            no keyframes or loop closing is disabled.
+            no keyframes or loop closing is disabled. A frame of a further camera moves with this keyframe.
         revisits: whether the frame is at a place that the trajectory visited before, without a loop closure yet.
     """
 
@@ -51,6 +51,11 @@ class Observation:
     verdict: Verdict = "ok"
     held_out: bool = False
     is_poor: bool = False
+
+    @property
+    def camera_name(self) -> str:
+        """Name of the camera; empty for the first one."""
+        return self.prepared.frame.camera_name
 
     @property
     def stamp(self) -> float:

@@ -91,7 +91,7 @@ class Refiner:
         map would forget older views otherwise.
         """
         for _ in takewhile(lambda _: not stop(), range(iterations if len(model) else 0)):
-            is_new = keyframes[-1].number > self._latest_refined
+            is_new = keyframes[-1].number != self._latest_refined
             self._latest_refined = keyframes[-1].number
             self.step(model, keyframes[-1] if is_new else self._draw(keyframes))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -43,6 +43,7 @@ class FrameRow:
         covariance: of the pose, as in :class:`splatbot.slam.FrameResult`: the 21 values of the upper triangle by
             rows; or None if there is no pose.
         skipped: tracking stages that were left out for lack of time.
+        camera_name: name of the camera; empty for the first one.
     """
 
     index: int
@@ -58,6 +59,7 @@ class FrameRow:
     late: bool = False
     covariance: tuple[float, ...] | None = None
     skipped: tuple[str, ...] = ()
+    camera_name: str = ""
 
     @property
     def processed(self) -> bool:
@@ -86,6 +88,10 @@ class RunFolder:
         self.audit = self.path / "audit.json"
         self.is_new = False
 
+    def trajectory_of(self, camera_name: str) -> Path:
+        """Return the path of the poses of a camera: that of the first one is ``trajectory``."""
+        return self.path / f"trajectory-{camera_name}.tum" if camera_name else self.trajectory
+
     @classmethod
     def create(cls, path: str | Path) -> RunFolder:
         """Create the folder if it does not exist; files of an earlier run stay until :meth:`save` replaces them.
@@ -111,7 +117,7 @@ class RunFolder:
         *,
         config: Config,
         rows: Sequence[FrameRow],
-        trajectory: Trajectory,
+        trajectories: Mapping[str, Trajectory],
         model: GaussianModel,
         metrics: Mapping[str, Any],
     ) -> None:
@@ -120,18 +126,20 @@ class RunFolder:
         The files are replaced once all are written: a full disk leaves those of the last save as they were.
         """
         rows_text = "\n".join([*(json.dumps(asdict(row)) for row in rows), ""])
+        poses = {self.trajectory_of(name).name: _writer(trajectory) for name, trajectory in trajectories.items()}
+        older = [path.name for path in self._further_trajectories() if path.name not in poses]
         replace_files(
             self.path,
             {
                 # unobserved Gaussians must stay marked for collision checks
                 self.map.name: lambda path: save_ply(model, path, bookkeeping=True),
-                self.trajectory.name: lambda path: _save_trajectory(trajectory, path),
+                **poses,
                 self.frames.name: write_text(rows_text),
                 self.config.name: write_text(config.to_yaml()),
                 self.metrics.name: write_text(_metrics_text(metrics)),
             },
             # a run that is killed from here on has no checksums
-            remove=(self.report.name, self.map_page.name, self.audit.name, self.mapped.name, SUMS),
+            remove=(self.report.name, self.map_page.name, self.audit.name, self.mapped.name, *older, SUMS),
         )
         write_sums(self.path, self._files())
 
@@ -210,33 +218,45 @@ class RunFolder:
                 ) from error
         return rows
 
-    def load_trajectory(self) -> Trajectory:
-        """Load the poses of the tracked frames."""
-        return Trajectory.load(self._require(self.trajectory))
+    def load_trajectory(self, camera_name: str = "") -> Trajectory:
+        """Load the poses of the tracked frames of a camera, by default of the first one."""
+        return Trajectory.load(self._require(self.trajectory_of(camera_name)))
+
+    def load_trajectories(self) -> dict[str, Trajectory]:
+        """Load the poses of the tracked frames of each camera by its name; the first camera has the empty name."""
+        names = dict.fromkeys(["", *(row.camera_name for row in self.load_frames() if row.tracked)])
+        return {name: self.load_trajectory(name) for name in names}
 
     def load_poses(self) -> dict[int, NDArray[np.float64]]:
-        """Load T_world_camera (4, 4) of every tracked frame, by its position in the log.
+        """Load T_world_camera (4, 4) of every tracked frame of all cameras, by its position in the log.
 
         Raises:
-            FormatError: ``frames.jsonl`` and ``trajectory.tum`` do not match.
+            FormatError: ``frames.jsonl`` and the files of poses do not match.
         """
         rows = [row for row in self.load_frames() if row.tracked]
+        poses: dict[int, NDArray[np.float64]] = {}
+        for name in dict.fromkeys(row.camera_name for row in rows):
+            poses |= self._poses_of(name, [row for row in rows if row.camera_name == name])
+        return dict(sorted(poses.items()))
+
+    def _poses_of(self, camera_name: str, rows: Sequence[FrameRow]) -> dict[int, NDArray[np.float64]]:
+        """Load the poses of the tracked frames of one camera, given their rows."""
         indices = [row.index for row in rows]
-        trajectory = self.load_trajectory() if rows else None
-        poses = list(trajectory.T_world_camera) if trajectory is not None else []
-        if trajectory is not None and len(rows) < len(poses) and self._was_killed():
+        trajectory = self.load_trajectory(camera_name)
+        poses = list(trajectory.T_world_camera)
+        if len(rows) < len(poses) and self._was_killed():
             poses = poses[: len(rows)]  # killed between writing the two files
         if len(indices) != len(poses):
             raise FormatError(
                 f"has {len(poses)} poses, {self.frames.name} has {len(indices)} tracked frames.",
-                file=self.trajectory,
+                file=self.trajectory_of(camera_name),
                 hint="restore the file, or run `splatbot map` again",
             )
         return dict(zip(indices, poses, strict=True))
 
     def load_covariances(self) -> NDArray[np.float64] | None:
-        """Load the covariances (N, 6, 6) of the tracked frames, or None if the run did not write them."""
-        packed = [row.covariance for row in self.load_frames() if row.tracked]
+        """Load the covariances (N, 6, 6) of the tracked frames of the first camera, or None if they are unknown."""
+        packed = [row.covariance for row in self.load_frames() if row.tracked and not row.camera_name]
         if not packed or any(values is None or len(values) != 21 for values in packed):
             return None
         full = np.zeros((len(packed), 6, 6))
@@ -257,8 +277,11 @@ class RunFolder:
 
     def _files(self) -> list[str]:
         paths = [self.config, self.trajectory, self.frames, self.metrics, self.map]
-        paths += [self.report, self.map_page, self.audit]
+        paths += [self.report, self.map_page, self.audit, *self._further_trajectories()]
         return [path.name for path in paths]
+
+    def _further_trajectories(self) -> list[Path]:
+        return sorted(self.path.glob("trajectory-*.tum"))
 
     def _replace(self, path: Path, text: str) -> None:
         """Write a file, and its checksum if the run has checksums; killed in between, the run has none."""
@@ -278,6 +301,10 @@ class RunFolder:
             raise FormatError("is missing.", file=path, hint=_NOT_A_RUN)
         check_file(path)
         return path
+
+
+def _writer(trajectory: Trajectory) -> Callable[[Path], None]:
+    return lambda path: _save_trajectory(trajectory, path)
 
 
 def _save_trajectory(trajectory: Trajectory, path: Path) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatbot.gaussians import GaussianModel
+from splatbot.mapping.keyframes import first_number
 from splatbot.results.folder import RunFolder
 
 
@@ -16,10 +17,12 @@ def observers(run: RunFolder, model: GaussianModel) -> NDArray[np.float64]:
         FormatError: the folder is damaged.
     """
     poses = run.load_poses()
-    keyframes = [row.index for row in run.load_frames() if row.keyframe]
-    known = np.full((len(keyframes) + 1, 3), np.nan)  # the last row is for Gaussians without a keyframe
-    for number, index in enumerate(keyframes):
-        if index in poses:
-            known[number] = poses[index][:3, 3]
-    anchors = model.anchors.numpy()
-    return known[np.where((anchors >= 0) & (anchors < len(keyframes)), anchors, len(keyframes))]
+    rows, config, anchors = run.load_frames(), run.load_config(), model.anchors.numpy()
+    found = np.full((len(anchors), 3), np.nan)
+    for name in ("", *config.cameras):
+        keyframes = [row.index for row in rows if row.keyframe and row.camera_name == name]
+        known = np.array([poses[i][:3, 3] if i in poses else 3 * [np.nan] for i in keyframes]).reshape(-1, 3)
+        numbers = anchors - first_number(name, config)
+        own = (numbers >= 0) & (numbers < len(keyframes))
+        found[own] = known[numbers[own]]
+    return found

@@ -45,7 +45,7 @@ def rescore(folder: RunFolder, log: Log, reference: Trajectory | None = None) ->
     )
     held_out = {row.index: poses[row.index] for row in rows if row.held_out and row.index in poses}
     model = GaussianModel.load(folder.map)
-    rectified = RectifiedLog(log, folder.load_config().sensor, folder.load_trajectory())
+    rectified = RectifiedLog(log, folder.load_config(), folder.load_trajectories())
     views = score_views(rectified, model, held_out)
     counts = {
         "frames": sum(row.processed for row in rows),

@@ -123,5 +123,5 @@ def _views(run: RunFolder, log: Log, poses: Mapping[int, Array], indices: Sequen
 
 
 def rectified_log(run: RunFolder, log: Log) -> RectifiedLog:
-    """Return the frames as the run mapped them: moved to their stamps by its trajectory."""
-    return RectifiedLog(log, run.load_config().sensor, run.load_trajectory())
+    """Return the frames as the run mapped them: moved to their stamps by its trajectories."""
+    return RectifiedLog(log, run.load_config(), run.load_trajectories())

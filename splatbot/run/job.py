@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from splatbot.config import Config, with_sensor
+from splatbot.config import Config, with_cameras, with_sensor
 from splatbot.errors import InputError, LogError
 from splatbot.logs import Log
 from splatbot.logs.live import RecordedCamera
@@ -97,11 +97,16 @@ def map_log(
         resume.place.check(log)
         config, slam = resume.config, resume.slam
     if localise is not None:
-        config, slam = localise.config, localise.slam
-        slam.localise_only()
+        slam = localise.slam
+        config = with_cameras(localise.config.model_copy(update={"cameras": {}}), log.cameras, file=log.uri)
+        slam.localise_only(config)
     config = config or (slam.config if slam else Config())
     if slam is None:
         config = with_sensor(config, log.calibration.sensor, file=log.calibration.file)
+        config = with_cameras(config, log.cameras, file=log.uri)
+    if not log.cameras.keys() <= config.cameras.keys():
+        hint = "restore the file of the cameras, or map the log again"
+        raise InputError("lists other cameras than the run.", file=log.uri, field="cameras", hint=hint)
     realtime = realtime or rate is not None or isinstance(log, RecordedCamera)
     if rate is not None and not 0 < rate < 1e4:
         raise InputError(f"is {rate}.", field="rate", hint="give frames per second, above 0")
@@ -129,7 +134,7 @@ def map_log(
                 model=loop.slam.snapshot().model,
                 rows=loop.rows(),
                 costs=cost_metrics(loop.rows()),
-                trajectory=loop.slam.trajectory,
+                trajectories={name: loop.slam.trajectory_of(name) for name in ("", *config.cameras)},
                 track=score_trajectory(loop.slam.trajectory, truth, loop.covariances()),
             )
 

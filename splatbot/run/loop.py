@@ -210,6 +210,7 @@ class FrameLoop:
                 late=r.index in self.source.late,
                 covariance=None if r.covariance is None else tuple(r.covariance[np.triu_indices(6)].tolist()),
                 skipped=tuple(r.skipped),
+                camera_name=r.camera_name,
             )
             for r in self.slam.results
         ]
@@ -218,8 +219,8 @@ class FrameLoop:
         return sorted(rows, key=lambda row: row.index)
 
     def covariances(self) -> NDArray[np.float64] | None:
-        """Return the covariances (N, 6, 6) of the tracked poses, or None if one is unknown."""
-        tracked = [r.covariance for r in self.slam.results if r.T_world_camera is not None]
+        """Return the covariances (N, 6, 6) of the first camera's tracked poses, or None if one is unknown."""
+        tracked = [r.covariance for r in self.slam.results if r.T_world_camera is not None and not r.camera_name]
         if any(covariance is None for covariance in tracked):
             return None
         return np.array(tracked, dtype=np.float64).reshape(-1, 6, 6)

@@ -16,6 +16,7 @@ from splatbot.errors import SplatbotError
 from splatbot.gaussians import GaussianModel
 from splatbot.report import report_html
 from splatbot.results.audit import RunAudit, audit_metrics, audit_run
+from splatbot.results.cameras import camera_metrics
 from splatbot.results.folder import FrameRow, RunFolder
 from splatbot.results.metrics import without_nan
 from splatbot.results.scoring import TrajectoryScore, ViewScores, score_views, trajectory_metrics
@@ -41,7 +42,7 @@ class RunOutcome:
     model: GaussianModel
     rows: list[FrameRow]
     costs: dict[str, Any]
-    trajectory: Trajectory
+    trajectories: dict[str, Trajectory]
     track: TrajectoryScore | None
     views: ViewScores = field(default_factory=ViewScores)
     finished: bool = False
@@ -69,7 +70,7 @@ class RunOutcome:
         folder.save(
             config=self.loop.config,
             rows=self.rows,
-            trajectory=self.trajectory,
+            trajectories=self.trajectories,
             model=self.model,
             metrics=self.metrics(),
         )
@@ -78,7 +79,7 @@ class RunOutcome:
         self.loop.progress("scoring")
         poses = self._poses()
         held_out = {i: poses[i] for i in sorted(self.loop.held_out) if i in poses}
-        log = RectifiedLog(self.loop.source.log, self.loop.config.sensor, self.trajectory)
+        log = RectifiedLog(self.loop.source.log, self.loop.config, self.trajectories)
         self.views = score_views(
             log,
             self.model,
@@ -99,7 +100,7 @@ class RunOutcome:
                 rows=self.rows,
                 metrics=self.metrics(),
                 config=self.loop.config,
-                trajectory=self.trajectory,
+                trajectory=self.trajectories[""],
                 track=self.track,
                 views=self.views,
                 map_page=map_page,
@@ -116,7 +117,7 @@ class RunOutcome:
         if self.map_page is None or not len(self.model):
             return None
         try:
-            folder.save_map_page(self.map_page(self.model, self.trajectory))
+            folder.save_map_page(self.map_page(self.model, self.trajectories[""]))
         except (SplatbotError, OSError) as error:
             _log.warning("the report has no interactive map: %s", error)
             return None
@@ -130,6 +131,7 @@ class RunOutcome:
             **trajectory_metrics(self.track),
             **self.views.metrics(),
             **audit_metrics(self.audit),
+            "cameras": camera_metrics(self.rows, self.loop.slam.further_cameras),
             "gaussians": len(self.model),
             "map_bytes": self.model.nbytes,
             "paced": self.loop.source.pace,

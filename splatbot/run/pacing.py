@@ -80,22 +80,20 @@ class PacedSource(LogFrames):
         try:
             while (arrival := reader.take(clock)) is not None:
                 clock.sleep_until(arrival)
-                if isinstance(arrival.frame, Frame) and self._superseded(reader, clock):
+                if isinstance(arrival.frame, Frame) and self._superseded(arrival.frame, reader, clock):
                     self.dropped.append(arrival.index)
                     continue
                 yield arrival
-                if self._superseded(reader, clock):
+                if isinstance(arrival.frame, Frame) and self._superseded(arrival.frame, reader, clock):
                     self.late.add(arrival.index)
         finally:
             reader.stop()
 
     @staticmethod
-    def _superseded(reader: _FrameReader, clock: _Schedule) -> bool:
-        """Return whether a newer frame has arrived."""
-        newer = reader.peek()
-        if newer is None or not isinstance(newer.frame, Frame):  # an unreadable frame replaces no other
-            return False
-        return clock.due(newer) <= time.perf_counter()
+    def _superseded(frame: Frame, reader: _FrameReader, clock: _Schedule) -> bool:
+        """Return whether a newer frame of the same camera has arrived."""
+        newer = reader.next_of(frame.camera_name)
+        return newer is not None and clock.due(newer) <= time.perf_counter()
 
 
 class CameraFrames(LogFrames):
@@ -203,10 +201,11 @@ class _FrameReader:
         clock.add_decoding_wait(arrival, since)
         return arrival
 
-    def peek(self) -> Arrival | None:
-        """Return the next frame without removing it, or None if it is not decoded yet."""
+    def next_of(self, camera_name: str) -> Arrival | None:
+        """Return the next decoded frame of a camera without removing it; an unreadable frame replaces no other."""
         with self._change:
-            return self._ready[0] if self._ready else None
+            frames = ((arrival, arrival.frame) for arrival in self._ready)
+            return next((a for a, f in frames if isinstance(f, Frame) and f.camera_name == camera_name), None)
 
     def stop(self) -> None:
         """Stop decoding."""

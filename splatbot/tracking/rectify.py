@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import cv2
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 
 from splatbot import _native
 from splatbot.camera import Camera
-from splatbot.config import SensorConfig
+from splatbot.config import Config, SensorConfig
 from splatbot.frame import Frame
 from splatbot.geometry import inverse, se3_exp, se3_log
 from splatbot.logs.base import DerivedLog, Log
@@ -67,17 +68,18 @@ class RectifiedLog(DerivedLog):
 
     Args:
         log: the log.
-        sensor: see :func:`rectify`.
-        trajectory: poses T_world_camera of its frames.
+        config: configuration with the sensor of each camera, see :func:`rectify`.
+        trajectories: poses T_world_camera of the frames of each camera by its name.
     """
 
-    def __init__(self, log: Log, sensor: SensorConfig, trajectory: Trajectory) -> None:
+    def __init__(self, log: Log, config: Config, trajectories: Mapping[str, Trajectory]) -> None:
         super().__init__(log)
-        self._sensor, self._trajectory = sensor, trajectory
+        self._config, self._trajectories = config, trajectories
 
     def _decode(self, index: int) -> Frame:
         frame = self._log[index]
-        return rectify(frame, twist_at(self._trajectory, frame.stamp), self._sensor)
+        trajectory, config = self._trajectories.get(frame.camera_name), self._config.of_camera(frame.camera_name)
+        return frame if trajectory is None else rectify(frame, twist_at(trajectory, frame.stamp), config.sensor)
 
 
 def twist_at(trajectory: Trajectory, stamp: float) -> Array:

@@ -117,6 +117,13 @@ class Tracker:
         """Return the expected twist (6,) [m/s, rad/s] of the camera at a time [s], to rectify the frame."""
         return self._velocity.at(stamp)
 
+    def pose_at(self, stamp: float) -> tuple[Array, Array]:
+        """Return the pose (4, 4) at a time [s] by the velocity, and the covariance (6, 6) of the last pose.
+
+        The covariance is that of the motion against the keyframes, of the twist (t [m], ω [rad]) in the camera's frame.
+        """
+        return self.motion.predict(stamp), self._last_covariance
+
     def keypoints(self, prepared: PreparedFrame, estimate: PoseEstimate) -> Callable[[], Features]:
         """Return a function that detects the keypoints of a frame that becomes a keyframe, in the calling thread.
 

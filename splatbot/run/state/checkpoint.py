@@ -22,7 +22,7 @@ from splatbot.frame import Frame
 from splatbot.logs import Log
 from splatbot.run.state.container import read_container, write_container
 from splatbot.run.state.journal import Entry, Journal, read_entry
-from splatbot.run.state.schema import FORMAT_VERSION, upgrade_version_1
+from splatbot.run.state.schema import FORMAT_VERSION, upgrade_version_1, upgrade_version_2
 from splatbot.run.state.tree import Decoder, Encoder
 from splatbot.slam import Slam
 
@@ -235,11 +235,13 @@ def _decode(
 ) -> tuple[Slam, dict[str, Any]]:
     """Decode the objects of a state; version 1 has no version number in its header."""
     version = header.get("format", 1)
-    if version not in (1, FORMAT_VERSION):
+    if version not in range(1, FORMAT_VERSION + 1):
         raise ValueError(f"it has version {version} of the format, this splatbot reads 1 to {FORMAT_VERSION}")
     decoder = Decoder(config, arrays, kept, version)
     values = decoder.decode(header["tree"])
     if version == 1:
         warnings.warn(_DEPRECATED, DeprecatedNameWarning, stacklevel=3)
         upgrade_version_1(values["slam"], decoder.unused)
+    if version < 3:
+        upgrade_version_2(values["slam"])
     return values["slam"], values["loop"]

@@ -16,6 +16,8 @@ from splatbot.config import Config
 from splatbot.gaussians import GaussianModel
 from splatbot.mapping.depth_fusion import DepthNoiseModel
 from splatbot.mapping.dynamic_objects import DynamicObjectFilter
+from splatbot.mapping.extrinsics import ConstantPose, MeasuredPose
+from splatbot.mapping.further_camera import FreeCamera, MountedCamera
 from splatbot.mapping.joint_motion import JointMotionMonitor
 from splatbot.mapping.keyframe_choice import FrameQuality
 from splatbot.mapping.keyframes import Keyframe
@@ -35,8 +37,8 @@ from splatbot.tracking.tracker import Tracker
 from splatbot.tracking.uncertainty import Uncertainty
 from splatbot.tracking.velocity import CameraVelocity
 
-FORMAT_VERSION = 2
-"""Version of the saved state. Version 1 names modules, classes and attributes of splatbot 0.1."""
+FORMAT_VERSION = 3
+"""Version of the saved state. Version 1 names modules, classes and attributes of splatbot 0.1; 2 has one camera."""
 
 
 @dataclass(frozen=True)
@@ -84,21 +86,22 @@ TYPES: Mapping[str, SavedType] = {
             "_tracker",
             "_mapper",
             "_location",
-            "_image_size",
+            "_image_sizes",
+            "_further_cameras",
             "_localization_only",
             "_joint_motion",
             "_quality",
         ),
         transient=frozenset({"_executor", "_first"}),
         create=Slam,
-        added=frozenset({"quality"}),
+        added=frozenset({"quality", "further_cameras"}),
     ),
-    "frame_result": _dataclass(FrameResult),
+    "frame_result": _dataclass(FrameResult, "camera_name"),
     "graph_location": _dataclass(GraphLocation),
     "joint_motion": SavedType(JointMotionMonitor, _fields("still_speed", "_last")),
     "camera": _dataclass(Camera),
     "gaussians": _dataclass(GaussianModel),
-    "keyframe": _dataclass(Keyframe, "is_poor"),
+    "keyframe": _dataclass(Keyframe, "is_poor", "camera_name"),
     "mapper": SavedType(
         Mapper,
         _fields(
@@ -112,13 +115,15 @@ TYPES: Mapping[str, SavedType] = {
             "_dynamic_objects",
             "_depth_noise",
             "_unmapped_seen",
+            "_anchors",
             "_robot_moving",
             "_frozen",
             "_stamp",
-            "_observed_stamp",
+            "_observed_stamps",
         ),
         transient=frozenset({"_lock", "_submitted", "_latest", "_added", "_inserted"}),
         create=Mapper,
+        added=frozenset({"anchors"}),
     ),
     "loop_closer": SavedType(
         LoopCloser,
@@ -142,6 +147,10 @@ TYPES: Mapping[str, SavedType] = {
     "adam": SavedType(GaussianAdam, _fields("rates", "steps", "skipped", "first", "second")),
     "dynamic_objects": SavedType(DynamicObjectFilter, _fields("timeout=timeout_s", "_cells", "_since", "_seen")),
     "depth_noise": _dataclass(DepthNoiseModel),
+    "mounted_camera": SavedType(MountedCamera, _fields("pose", "carried", "anchor", "_retry_at")),
+    "free_camera": SavedType(FreeCamera, _fields("tracker", "anchor")),
+    "constant_pose": _dataclass(ConstantPose),
+    "measured_pose": _dataclass(MeasuredPose),
     "tracker": SavedType(
         Tracker,
         _fields(
@@ -216,7 +225,7 @@ mapping_worker            splatbot.mapping.worker:MappingWorker
 # Attributes of version 1 whose field name is not the attribute without underscore: stable name, attribute, field.
 _VERSION_1_FIELDS = """
 slam                      _motion     joint_motion
-slam                      _size       image_size
+slam                      _size       image_sizes
 joint_motion              still       still_speed
 keyframe                  still       static_mask
 mapper                    owed        pending_iterations
@@ -253,6 +262,19 @@ def version_1_field(type_name: str, attribute: str) -> str:
     return renamed.get((type_name, attribute), attribute.lstrip("_"))
 
 
+# Fields of version 2 that have another name: type, its field, field of this version.
+_VERSION_2_FIELDS = """
+slam    image_size      image_sizes
+mapper  observed_stamp  observed_stamps
+"""
+
+
+def version_2_field(type_name: str, field: str) -> str:
+    """Return the stable field name of a field of version 2."""
+    renamed = {(stable, old): now for stable, old, now in _rows(_VERSION_2_FIELDS)}
+    return renamed.get((type_name, field), field)
+
+
 @cache
 def _rows(table: str) -> Sequence[Sequence[str]]:
     return [line.split() for line in table.strip().splitlines()]
@@ -268,8 +290,20 @@ def upgrade_version_1(slam: Slam, unused: Mapping[str, Mapping[str, Any]]) -> No
     mapper, outer = slam._mapper, unused.get("slam", {})
     mapper.loops.adjacency = mapper.loops.graph.adjacency()
     mapper.set_robot_moving(unused.get("mapping_worker", {}).get("held", mapper._robot_moving))
-    mapper._observed_stamp = outer.get("looked", mapper._observed_stamp)
+    if "looked" in outer:
+        vars(mapper)["_observed_stamps"] = outer["looked"]
     slam._location = GraphLocation(unused.get("loop_closer", {}).get("anchor"))
     if not outer.get("growing", True):
         slam._localization_only = True
         mapper.freeze()
+
+
+def upgrade_version_2(slam: Slam) -> None:
+    """Convert the values of a SLAM of version 2 or 1, which has one camera, to those by name of the camera."""
+    mapper, size, stamp = slam._mapper, vars(slam)["_image_sizes"], vars(slam._mapper)["_observed_stamps"]
+    if not isinstance(size, dict):
+        slam._image_sizes = {} if size is None else {"": size}
+    if not isinstance(stamp, dict):
+        mapper._observed_stamps = {"": stamp}
+    if not isinstance(mapper._unmapped_seen, set):
+        mapper._unmapped_seen = {""} if mapper._unmapped_seen else set()

@@ -14,7 +14,14 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from splatbot.config import Config
-from splatbot.run.state.schema import FORMAT_VERSION, TYPES, type_names, version_1_field, version_1_type
+from splatbot.run.state.schema import (
+    FORMAT_VERSION,
+    TYPES,
+    type_names,
+    version_1_field,
+    version_1_type,
+    version_2_field,
+)
 
 Array = NDArray[Any]
 Tree = Any
@@ -36,7 +43,7 @@ class Encoder:
 
     def __init__(self, config: Config, keep: Callable[[object, Array], Tree | None]) -> None:
         self.arrays: list[Array] = []
-        self._sections = [(name, getattr(config, name)) for name in type(config).model_fields]
+        self._sections = sections_of(config)
         self._config = config
         self._keep = keep
         self._known: dict[int, tuple[int, object]] = {}
@@ -98,10 +105,16 @@ class Encoder:
     def _section(self, value: BaseModel) -> Tree:
         if value is self._config or value == self._config:
             return {"$": "config", "is": ""}
-        for name, section in self._sections:
+        for name, section in self._sections.items():
             if value is section or value == section:
                 return {"$": "config", "is": name}
         raise TypeError(f"{type(value).__name__} is not a section of this run's configuration")
+
+
+def sections_of(config: Config) -> dict[str, Any]:
+    """Return the sections of a configuration by name, and those that further cameras have of their own."""
+    sections = {name: getattr(config, name) for name in type(config).model_fields}
+    return sections | {f"cameras.{name}.tracking": config.of_camera(name).tracking for name in config.cameras}
 
 
 class Decoder:
@@ -139,7 +152,7 @@ class Decoder:
         if kind == "scalar":
             return np.dtype(tree["dtype"]).type(self.decode(inner))
         if kind == "config":
-            return getattr(self._config, inner) if inner else self._config
+            return sections_of(self._config)[inner] if inner else self._config
         if kind == "again":
             return self._known[inner]
         index = len(self._known)
@@ -170,6 +183,8 @@ class Decoder:
         name, inner = tree["type"], tree["is"]
         if name not in TYPES:
             raise ValueError(f"{name} is not a type of a saved run")
+        if self._version == 2:
+            inner = {version_2_field(name, field): item for field, item in inner.items()}
         different = (inner.keys() ^ TYPES[name].fields.keys()) - TYPES[name].added
         if different:
             raise ValueError(f"{name} has other fields: {', '.join(sorted(different))}")

@@ -219,7 +219,7 @@ def test_an_unmapped_view_makes_one_keyframe(threaded: Threaded, monkeypatch: py
     gate, mapper = threading.Event(), threaded.mapper
     threaded.insert(at(0.0))
     with threaded.executor.paused():
-        mapper._unmapped_seen = True  # as an observed frame leaves it that the map does not cover
+        mapper._unmapped_seen = {""}  # as an observed frame leaves it that the map does not cover
         monkeypatch.setattr(mapper, "fuse", lambda *_: gate.wait(10))
     assert threaded.should_insert(at(0.01))
     threaded.insert(at(0.01))

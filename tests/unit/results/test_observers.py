@@ -34,7 +34,11 @@ def test_a_gaussian_was_seen_by_the_keyframe_that_made_it(tmp_path: Path) -> Non
     model.anchors[:] = torch.tensor([1, 0, -1, 7], dtype=torch.int32)
     run = RunFolder.create(tmp_path / "run")
     run.save(
-        config=Config(), rows=rows, trajectory=Trajectory(np.array([0.0, 0.2, 0.3]), poses), model=model, metrics={}
+        config=Config(),
+        rows=rows,
+        trajectories={"": Trajectory(np.array([0.0, 0.2, 0.3]), poses)},
+        model=model,
+        metrics={},
     )
     found = observers(run, model)
     np.testing.assert_array_equal(found[:2], [[2.0, 0.0, 0.0], [0.0, 0.0, 0.0]])

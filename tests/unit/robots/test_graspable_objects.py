@@ -53,7 +53,7 @@ def run_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     poses = np.stack([T for _, _, T in VIEWS])
     stamps = np.arange(len(VIEWS), dtype=np.float64)
     rows = [FrameRow(k, float(k), "ok", keyframe=True) for k in range(len(VIEWS))]
-    run.save(config=Config(), rows=rows, trajectory=Trajectory(stamps, poses), model=full, metrics={})
+    run.save(config=Config(), rows=rows, trajectories={"": Trajectory(stamps, poses)}, model=full, metrics={})
     Workspace(T_world_base=np.eye(4)).save(run.path / "scene.yaml")
     monkeypatch.setattr("splatbot.robots.graspable_objects.reopen_log", lambda run: None)
     monkeypatch.setattr("splatbot.robots.graspable_objects.subsampled_views", lambda run, log: VIEWS)

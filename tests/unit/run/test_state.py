@@ -35,6 +35,7 @@ from splatbot.tracking.tracker import pose_distance
 from tests.rgbd import small_config
 
 OLD_RUN = Path(__file__).parents[2] / "data" / "old_run"
+RUN_V2 = Path(__file__).parents[2] / "data" / "run_v2"  # 4 of 6 frames, by the last version with one camera a map
 LOG = "synthetic:tabletop?width=160&height=120&frames=14"
 
 
@@ -310,6 +311,22 @@ def test_a_state_of_a_later_version_is_refused(copy: Path) -> None:
     write_container(path, header | {"format": FORMAT_VERSION + 1}, arrays)
     with pytest.raises(FormatError, match=f"version {FORMAT_VERSION + 1}"):
         SavedRun.load(copy)
+
+
+def test_a_run_of_the_second_format_resumes(tmp_path: Path) -> None:
+    shutil.copytree(RUN_V2, tmp_path / "run")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", DeprecatedNameWarning)
+        saved = SavedRun.load(tmp_path / "run")
+    assert saved.place.next_index == 4
+    assert saved.slam._image_sizes == {"": (64, 48)}
+    assert saved.slam._mapper._unmapped_seen == set()
+    assert saved.slam._mapper._observed_stamps.keys() == {""}
+    log = open_log("synthetic:tabletop?width=64&height=48&frames=6")
+    resumed = map_log(log, out=tmp_path / "run", resume=saved, save_every=0.0, report=False)
+    assert (resumed.metrics["frames"], resumed.metrics["lost"]) == (6, 0)
+    assert resumed.metrics["ate_rmse_m"] < 2e-3
+    assert SavedRun.load(tmp_path / "run").place.next_index == 6
 
 
 def test_a_run_that_version_0_1_saved_is_resumed_and_localized_in_with_one_warning(tmp_path: Path) -> None:

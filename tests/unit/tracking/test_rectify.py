@@ -9,7 +9,7 @@ import pytest
 
 from splatbot import _native
 from splatbot.camera import Camera
-from splatbot.config import SensorConfig
+from splatbot.config import Config, SensorConfig
 from splatbot.frame import Frame
 from splatbot.geometry import inverse, se3_exp, se3_log, transform_points
 from splatbot.logs.synthetic import SyntheticLog
@@ -79,7 +79,7 @@ def test_a_rotation_of_the_depth_camera_shifts_its_image() -> None:
 def test_a_rolling_shutter_frame_becomes_that_of_a_global_shutter() -> None:
     uri = "synthetic:room?trajectory=turns&frames=10&width=320&height=240"
     ideal, rolling = SyntheticLog(uri), SyntheticLog(f"{uri}&effects=rolling_shutter:readout=0.03")
-    rectified = RectifiedLog(rolling, ROLLING, ideal.ground_truth)
+    rectified = RectifiedLog(rolling, Config(sensor=ROLLING), {"": ideal.ground_truth})
     exact, read, found = ideal[7], rolling[7], rectified[7]
     inner = (slice(20, -20), slice(20, -20))
     before, after = (np.abs(f.rgb[inner].astype(float) - exact.rgb[inner]).mean() for f in (read, found))

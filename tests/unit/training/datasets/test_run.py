@@ -38,7 +38,7 @@ def write_run(folder: Path, log: Path, **source: Any) -> Trajectory:
     RunFolder.create(folder).save(
         config=Config(),
         rows=ROWS,
-        trajectory=trajectory,
+        trajectories={"": trajectory},
         model=GaussianModel.empty(),
         metrics={"log": {"uri": str(log), **source}},
     )

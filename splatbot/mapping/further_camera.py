@@ -1,0 +1,189 @@
+"""Further cameras of a map: fixed in the world, carried by the first camera, or free."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatbot.config import CameraConfig, Config
+from splatbot.frame import Frame
+from splatbot.geometry import adjoint, inverse, pose_from_quat
+from splatbot.mapping.extrinsics import ConstantPose, MeasuredPose, locate_in_map, viewing_same_place
+from splatbot.mapping.keyframes import Keyframe
+from splatbot.tracking.estimate import PoseEstimate
+from splatbot.tracking.features import Features
+from splatbot.tracking.prepare import PreparedFrame, prepare, typical_depth
+from splatbot.tracking.tracker import Tracker
+from splatbot.tracking.uncertainty import Uncertainty
+
+Array = NDArray[np.float64]
+
+RETRY_S = 0.5
+"""Time [s] of the stream after a frame that could not be aligned to the map, before the next one is tried."""
+
+
+@dataclass(frozen=True)
+class MapState:
+    """The map and the first camera at the time of a frame of a further camera.
+
+    Args:
+        keyframes: all keyframes of the map.
+        variance_scale: see :attr:`splatbot.tracking.tracker.Tracker.variance_scale`.
+        first: pose of the first camera at the stamp of the frame; None while it is lost.
+        first_twist: (6,) [m/s, rad/s] velocity of the first camera in its own frame.
+    """
+
+    keyframes: Sequence[Keyframe]
+    variance_scale: float
+    first: MeasuredPose | None
+    first_twist: Array
+
+    @property
+    def first_keyframes(self) -> list[Keyframe]:
+        """Keyframes of the first camera."""
+        return [keyframe for keyframe in self.keyframes if not keyframe.camera_name]
+
+
+class FurtherCamera(Protocol):
+    """A camera of the map other than the first one.
+
+    ``anchor`` is the number of the keyframe of the first camera that the pose in the world moves with; None if that is
+    the keyframe at the time of the frame.
+    """
+
+    anchor: int | None
+
+    def prepare(self, frame: Frame, config: Config, state: MapState) -> PreparedFrame:
+        """Return the pyramid of a frame, rectified by the expected velocity of the camera."""
+        ...
+
+    def track(self, prepared: PreparedFrame, config: Config, state: MapState) -> PoseEstimate:
+        """Return the pose of a frame; the verdict is "lost" while it is unknown."""
+        ...
+
+    def keypoints(self, prepared: PreparedFrame, estimate: PoseEstimate) -> Callable[[], Features]:
+        """Return a function that detects the keypoints of a frame that becomes a keyframe."""
+        ...
+
+    def move(self, T_new_old: Array) -> None:
+        """Move the pose with a correction (4, 4) of the map at the camera."""
+        ...
+
+
+class MountedCamera:
+    """A camera at a constant pose: in the world, or on the first camera that carries it.
+
+    Args:
+        pose: its pose on the world or on the first camera.
+        carried: whether the first camera carries it.
+    """
+
+    def __init__(self, pose: ConstantPose, *, carried: bool) -> None:
+        self.pose, self.carried = pose, carried
+        self.anchor: int | None = None
+        self._retry_at = -np.inf
+
+    def prepare(self, frame: Frame, config: Config, state: MapState) -> PreparedFrame:
+        """See :class:`FurtherCamera`."""
+        if not self.carried:
+            return prepare(frame, config.tracking)
+        return prepare(frame, config.tracking, adjoint(inverse(self.pose.T_parent_camera)) @ state.first_twist)
+
+    def track(self, prepared: PreparedFrame, config: Config, state: MapState) -> PoseEstimate:
+        """See :class:`FurtherCamera`; a pose that is not exact is estimated against the map."""
+        parent = state.first if self.carried else _WORLD
+        if parent is None or not state.keyframes:
+            reason = "the first camera is lost" if state.keyframes else "the map has not begun"
+            return _lost(reason)
+        if not self.pose.known:
+            self._estimate(prepared, config, state, parent)
+        if not self.pose.known:
+            return _lost(self.pose.reason)
+        T = parent.T_world_camera @ self.pose.T_parent_camera
+        if not self.carried and self.anchor is None:
+            self.anchor = viewing_same_place(state.first_keyframes, T, typical_depth(prepared))[0].number
+        A = adjoint(inverse(self.pose.T_parent_camera))
+        covariance = self.pose.covariance + A @ parent.covariance @ A.T
+        return PoseEstimate(T, "ok", (), "extrinsics", Uncertainty(covariance))
+
+    def keypoints(self, prepared: PreparedFrame, estimate: PoseEstimate) -> Callable[[], Features]:
+        """See :class:`FurtherCamera`; no frame is tracked against those of a mounted camera."""
+        return Features.none
+
+    def move(self, T_new_old: Array) -> None:
+        """See :class:`FurtherCamera`; a carried camera moves with the first one."""
+        if not self.carried:
+            self.pose.move(T_new_old)
+
+    def _estimate(self, prepared: PreparedFrame, config: Config, state: MapState, parent: MeasuredPose) -> None:
+        """Align a frame to the map and add the pose on the parent to those that must agree."""
+        stamp = prepared.frame.stamp
+        if self._retry_at - RETRY_S <= stamp < self._retry_at:
+            return
+        start = parent.T_world_camera @ self.pose.start()
+        found = locate_in_map(prepared, state.first_keyframes, start, config)
+        if isinstance(found, str):
+            self._retry_at = stamp + RETRY_S
+            self.pose.add(found)
+            return
+        A = adjoint(inverse(found.T_world_camera) @ parent.T_world_camera)
+        T_parent_camera = inverse(parent.T_world_camera) @ found.T_world_camera
+        self.pose.add(MeasuredPose(T_parent_camera, found.covariance + A @ parent.covariance @ A.T))
+
+
+class FreeCamera:
+    """A camera that moves on its own: it is found in the map by its features, and tracked against all keyframes.
+
+    Args:
+        config: of the camera.
+    """
+
+    def __init__(self, config: Config) -> None:
+        self.tracker = Tracker(config.tracking)
+        self.tracker.forget()
+        self.anchor: int | None = None
+
+    def prepare(self, frame: Frame, config: Config, state: MapState) -> PreparedFrame:
+        """See :class:`FurtherCamera`."""
+        return prepare(frame, config.tracking, self.tracker.expected_twist(frame.stamp))
+
+    def track(self, prepared: PreparedFrame, config: Config, state: MapState) -> PoseEstimate:
+        """See :class:`FurtherCamera`."""
+        if not state.keyframes:
+            return _lost("the map has not begun")
+        self.tracker.variance_scale = state.variance_scale
+        return self.tracker.track(prepared, state.keyframes)
+
+    def keypoints(self, prepared: PreparedFrame, estimate: PoseEstimate) -> Callable[[], Features]:
+        """See :class:`FurtherCamera`."""
+        return self.tracker.keypoints(prepared, estimate)
+
+    def move(self, T_new_old: Array) -> None:
+        """See :class:`FurtherCamera`."""
+        self.tracker.move(T_new_old)
+
+
+def make_camera(camera: CameraConfig, config: Config) -> FurtherCamera:
+    """Return the further camera that a configuration describes.
+
+    Args:
+        camera: its description.
+        config: configuration of the run with the camera's sensor, see :meth:`splatbot.config.Config.of_camera`.
+    """
+    given = camera.T_world_camera or camera.T_first_camera
+    if given is None:
+        return FreeCamera(config)
+    T = pose_from_quat(given.translation, given.quaternion_wxyz)
+    pose = ConstantPose(T, (camera.translation_sigma, camera.rotation_sigma))
+    return MountedCamera(pose, carried=camera.T_first_camera is not None)
+
+
+_WORLD = MeasuredPose(np.eye(4), np.zeros((6, 6)))
+
+
+def _lost(reason: str) -> PoseEstimate:
+    return PoseEstimate(np.eye(4), "lost", (reason,), "extrinsics")
