@@ -42,9 +42,10 @@ def open_log(
     """Open the log that ``uri`` names; frames are decoded only when read.
 
     Args:
-        uri: a folder in TUM, Replica, 7-Scenes, Open3D, ScanNet or Nerfstudio layout, or a `.sens` or `.r3d` file. A
-            recording of RealSense is a `.db3` or `.bag`. A recording of ROS topics is an `.mcap`, a rosbag2 folder or a
-            `.bag`. A `.yaml` file lists several cameras (:mod:`splatbot.logs.rig`). Select one of several cameras by
+        uri: a folder in TUM, Replica, 7-Scenes, Open3D, ScanNet, Nerfstudio or COLMAP layout, or a `.sens` or `.r3d`
+            file. A recording of RealSense is a `.db3` or `.bag`. A recording of ROS topics is an `.mcap`, a rosbag2
+            folder or a `.bag`. A `.yaml` file lists several cameras (:mod:`splatbot.logs.rig`). In a COLMAP folder,
+            `?depth_scale=5000` gives units of depth per metre. Select one of several cameras by
             `FILE?color=TOPIC&depth=TOPIC&info=TOPIC`. In a LeRobot dataset, `FOLDER?episode=N&color=KEY&depth=KEY`
             selects an episode and a camera. In TUM folders and recordings of ROS topics, `?pair_within=0.05` is the
             largest difference [s] of the stamps of colour and depth, 0.02 by default. Generated logs have the form
