@@ -1,0 +1,179 @@
+"""Frames of further cameras go into the map of the first one, at poses that are given, estimated or tracked."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from splatbot.config import CameraConfig, Config, MappingConfig
+from splatbot.errors import InputError
+from splatbot.frame import Frame
+from splatbot.geometry import inverse, se3_exp
+from splatbot.logs.synthetic import SyntheticLog
+from splatbot.mapping.further_camera import MountedCamera
+from splatbot.mapping.keyframes import NUMBERS
+from splatbot.slam import Slam
+from splatbot.tracking.nearby_keyframes import pose_distance
+from tests.several_cameras import WRONG, estimated, frames_of, in_order, in_world, pose_config, side_view, wrist_log
+
+FRAMES = 20
+T_FIRST_CARRIED = se3_exp(np.array([0.05, -0.02, 0.01, 0.1, -0.15, 0.05]))
+
+
+@cache
+def wrist() -> SyntheticLog:
+    return wrist_log(FRAMES, width=240, height=180)
+
+
+@cache
+def table_pose() -> NDArray[np.float64]:
+    """T_scene_camera of a fixed camera."""
+    return side_view(wrist(), np.radians(40), 0.1)
+
+
+@cache
+def table_frames() -> list[Frame]:
+    stamps = [k / 30 + 0.01 for k in range(FRAMES)]
+    return frames_of(wrist(), [table_pose()] * FRAMES, stamps, "table", sigma_depth=0.002)
+
+
+def processed(camera: CameraConfig, frames: list[Frame], name: str = "table", **settings: MappingConfig) -> Slam:
+    slam = Slam(Config(cameras={name: camera}, **settings))
+    for frame in in_order(wrist(), frames):
+        slam.process(frame)
+    return slam
+
+
+def first_camera_error(slam: Slam) -> float:
+    truth = [in_world(wrist(), T) for T in wrist().ground_truth.T_world_camera]
+    return max(pose_distance(a, b)[0] for a, b in zip(truth, slam.trajectory.T_world_camera, strict=True))
+
+
+@cache
+def alone() -> Slam:
+    slam = Slam(Config())
+    for frame in wrist():
+        slam.process(frame)
+    return slam
+
+
+def test_a_fixed_camera_with_a_wrong_pose_is_estimated_and_mapped_and_the_first_one_is_as_accurate_as_alone() -> None:
+    T = in_world(wrist(), table_pose())
+    slam = processed(estimated(T @ WRONG, fixed=True), table_frames())
+    camera = slam.further_cameras["table"]
+    assert isinstance(camera, MountedCamera)
+    assert camera.pose.known
+    moved, turned = pose_distance(T, camera.pose.T_parent_camera)
+    assert moved < 2e-3
+    assert turned < np.radians(0.2)
+    keyframes = [k for k in slam.keyframes if k.camera_name]
+    assert [k.number for k in keyframes] == [NUMBERS]
+    assert keyframes[0].camera.width == 320
+    assert int((slam.snapshot().model.anchors >= NUMBERS).sum()) > 500
+    assert len(slam.trajectory) == FRAMES
+    assert len(slam.trajectory_of("table")) == FRAMES - 7  # eight frames determine the pose, the last of them has it
+    assert first_camera_error(slam) < first_camera_error(alone()) + 5e-4
+
+
+def test_an_exact_pose_is_used_from_the_first_frame_on() -> None:
+    T = in_world(wrist(), table_pose())
+    slam = processed(CameraConfig(T_world_camera=pose_config(T)), table_frames()[:2])
+    poses = slam.trajectory_of("table").T_world_camera
+    assert len(poses) == 2
+    assert np.allclose(poses, T, atol=1e-9)
+
+
+def test_a_carried_camera_is_estimated_on_the_first_one() -> None:
+    poses = [T @ T_FIRST_CARRIED for T in wrist().ground_truth.T_world_camera]
+    frames = frames_of(wrist(), poses, wrist().stamps, "side", sigma_depth=0.002)
+    slam = processed(estimated(T_FIRST_CARRIED @ WRONG, fixed=False), frames, "side")
+    camera = slam.further_cameras["side"]
+    assert isinstance(camera, MountedCamera)
+    assert camera.pose.known
+    moved, turned = pose_distance(T_FIRST_CARRIED, camera.pose.T_parent_camera)
+    assert moved < 2e-3
+    assert turned < np.radians(0.2)
+    found = slam.trajectory_of("side")
+    truth = [in_world(wrist(), T) for T in poses[-len(found) :]]
+    assert max(pose_distance(a, b)[0] for a, b in zip(truth, found.T_world_camera, strict=True)) < 3e-3
+
+
+def test_a_free_camera_is_found_in_the_map_and_tracked() -> None:
+    poses = [T @ se3_exp(np.array([0.03, 0.0, 0.0, 0.0, 0.05, 0.0])) for T in wrist().ground_truth.T_world_camera]
+    frames = frames_of(wrist(), poses, wrist().stamps, "head", width=240)
+    slam = processed(CameraConfig(), frames, "head")
+    found = slam.trajectory_of("head")
+    assert len(found) > FRAMES / 2
+    truth = [in_world(wrist(), T) for T in poses[-len(found) :]]
+    assert max(pose_distance(a, b)[0] for a, b in zip(truth, found.T_world_camera, strict=True)) < 3e-3
+
+
+def test_a_camera_that_moves_but_is_called_fixed_is_not_mapped() -> None:
+    poses = [table_pose() @ se3_exp(np.array([0.004 * k, 0, 0, 0, 0, 0])) for k in range(FRAMES)]
+    frames = frames_of(wrist(), poses, [k / 30 + 0.01 for k in range(FRAMES)], "table")
+    slam = processed(estimated(in_world(wrist(), poses[0]), fixed=True), frames)
+    results = [r for r in slam.results if r.camera_name]
+    assert {r.verdict for r in results} == {"lost"}
+    assert "contradict" in results[-1].reasons[0]
+    assert not any(k.camera_name for k in slam.keyframes)
+
+
+def test_a_frame_of_an_unknown_camera_or_of_another_size_is_refused_and_the_map_goes_on() -> None:
+    slam = Slam(Config(cameras={"table": CameraConfig(T_world_camera=pose_config(np.eye(4)))}))
+    slam.process(wrist()[0])
+    with pytest.raises(InputError, match="is 'shelf'"):
+        slam.process(replace(table_frames()[0], camera_name="shelf"))
+    slam.process(table_frames()[0])
+    small = frames_of(wrist(), [table_pose()], [0.05], "table", width=160, height=120)[0]
+    with pytest.raises(InputError, match="160 x 120, earlier frames are 320 x 180"):
+        slam.process(small)
+    assert slam.process(wrist()[1]).verdict == "ok"
+
+
+def test_the_cameras_have_no_pose_before_the_map_begins_or_while_the_first_camera_is_lost() -> None:
+    T_first = CameraConfig(T_first_camera=pose_config(T_FIRST_CARRIED))
+    slam = Slam(Config(cameras={"table": CameraConfig(T_world_camera=pose_config(np.eye(4))), "side": T_first}))
+    assert slam.process(table_frames()[0]).reasons == ("the map has not begun",)
+    slam.process(wrist()[0])
+    black = np.zeros_like(wrist()[1].rgb), np.zeros_like(wrist()[1].depth)
+    assert slam.process(replace(wrist()[1], rgb=black[0], depth=black[1])).verdict == "lost"
+    side = replace(table_frames()[1], camera_name="side", stamp=0.05)
+    assert slam.process(side).reasons == ("the first camera is lost",)
+
+
+def test_a_loop_closure_moves_keyframes_gaussians_results_and_pose_of_a_fixed_camera_together() -> None:
+    T = in_world(wrist(), table_pose())
+    still = MappingConfig(refine_iterations=0)
+    slam = processed(CameraConfig(T_world_camera=pose_config(T)), table_frames()[:3], mapping=still)
+    mapper = slam._mapper
+    anchor = slam.further_cameras["table"].anchor
+    assert anchor is not None
+    move = se3_exp(np.array([0.02, 0.01, 0.0, 0.0, 0.03, 0.0]))
+    before = mapper.model.means[mapper.model.anchors == NUMBERS].numpy().astype(np.float64)
+    first = {k.number: k.T_world_camera for k in mapper.first_keyframes}
+    mapper.loops.correction = {number: move if number == anchor else np.eye(4) for number in mapper.loops.graph.poses}
+    slam.close_loops()
+    keyframe = next(k for k in mapper.keyframes if k.camera_name)
+    assert np.allclose(keyframe.T_world_camera, move @ T)
+    assert np.allclose(keyframe.reference.T_world_camera, move @ T)
+    after = mapper.model.means[mapper.model.anchors == NUMBERS].numpy()
+    assert np.allclose(after, before @ move[:3, :3].T + move[:3, 3], atol=1e-5)
+    assert np.allclose(slam.trajectory_of("table").T_world_camera, move @ T)
+    moved = {k.number: k.T_world_camera @ inverse(first[k.number]) for k in mapper.first_keyframes}
+    assert np.allclose(moved[anchor], move)
+    frame = replace(table_frames()[3], index=99)
+    found = slam.process(frame).T_world_camera
+    assert found is not None
+    assert np.allclose(found, move @ T)
+
+
+def test_numbers_and_loops_of_the_first_camera_are_as_without_the_others() -> None:
+    slam = processed(CameraConfig(T_world_camera=pose_config(in_world(wrist(), table_pose()))), table_frames())
+    own = [k.number for k in slam._mapper.first_keyframes]
+    assert own == list(range(len(own)))
+    assert set(slam._mapper.loops.graph.poses) == set(own)
+    assert set(slam._mapper.loops.adjacency) <= set(own)
