@@ -117,7 +117,7 @@ class Slam:
         return self._record(frame, estimate, keyframe, clock)
 
     def _submit(self, observation: Observation) -> None:
-        """Submit a keyframe; one of the first camera becomes the location of the next frame in the pose graph."""
+        """Queue a keyframe; one of the first camera becomes the location of the next frame in the pose graph."""
         location = self._mapper.submit(observation)
         if not observation.camera_name:
             self._location = location

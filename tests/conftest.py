@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import os
+import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -48,6 +49,14 @@ def default_kernels() -> Iterator[None]:
     yield
     native().set_num_threads(0)
     native().set_isa("")
+
+
+@pytest.fixture(autouse=True, scope="session")
+def programs_obey_ctrl_c() -> Iterator[None]:
+    """Lets Ctrl-C reach the programs that tests start: a shell in the background has them ignore it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -51,8 +51,8 @@ class MapState:
 class FurtherCamera(Protocol):
     """A camera of the map other than the first one.
 
-    ``anchor`` is the number of the keyframe of the first camera that the pose in the world moves with; None if that is
-    the keyframe at the time of the frame.
+    Its pose in the world moves with a keyframe of the first camera. ``anchor`` is the number of that keyframe. If None,
+    it is the keyframe at the time of the frame.
     """
 
     anchor: int | None
@@ -88,13 +88,13 @@ class MountedCamera:
         self._retry_at = -np.inf
 
     def prepare(self, frame: Frame, config: Config, state: MapState) -> PreparedFrame:
-        """See :class:`FurtherCamera`."""
+        """Return the pyramid of a frame, rectified by the velocity of the first camera if that carries it."""
         if not self.carried:
             return prepare(frame, config.tracking)
         return prepare(frame, config.tracking, adjoint(inverse(self.pose.T_parent_camera)) @ state.first_twist)
 
     def track(self, prepared: PreparedFrame, config: Config, state: MapState) -> PoseEstimate:
-        """See :class:`FurtherCamera`; a pose that is not exact is estimated against the map."""
+        """Return the pose of a frame; a pose that is not exact is first estimated against the map."""
         parent = state.first if self.carried else _WORLD
         if parent is None or not state.keyframes:
             reason = "the first camera is lost" if state.keyframes else "the map has not begun"
@@ -111,11 +111,11 @@ class MountedCamera:
         return PoseEstimate(T, "ok", (), "extrinsics", Uncertainty(covariance))
 
     def keypoints(self, prepared: PreparedFrame, estimate: PoseEstimate) -> Callable[[], Features]:
-        """See :class:`FurtherCamera`; no frame is tracked against those of a mounted camera."""
+        """Return a function without keypoints: no frame is matched with those of a mounted camera."""
         return Features.none
 
     def move(self, T_new_old: Array) -> None:
-        """See :class:`FurtherCamera`; a carried camera moves with the first one."""
+        """Move the pose of a fixed camera; a carried one moves with the first camera."""
         if not self.carried:
             self.pose.move(T_new_old)
 
@@ -148,22 +148,22 @@ class FreeCamera:
         self.anchor: int | None = None
 
     def prepare(self, frame: Frame, config: Config, state: MapState) -> PreparedFrame:
-        """See :class:`FurtherCamera`."""
+        """Return the pyramid of a frame, rectified by the velocity of the camera."""
         return prepare(frame, config.tracking, self.tracker.expected_twist(frame.stamp))
 
     def track(self, prepared: PreparedFrame, config: Config, state: MapState) -> PoseEstimate:
-        """See :class:`FurtherCamera`."""
+        """Return the pose of a frame by tracking against all keyframes."""
         if not state.keyframes:
             return _lost("the map has not begun")
         self.tracker.variance_scale = state.variance_scale
         return self.tracker.track(prepared, state.keyframes)
 
     def keypoints(self, prepared: PreparedFrame, estimate: PoseEstimate) -> Callable[[], Features]:
-        """See :class:`FurtherCamera`."""
+        """Return a function that detects the keypoints of a frame."""
         return self.tracker.keypoints(prepared, estimate)
 
     def move(self, T_new_old: Array) -> None:
-        """See :class:`FurtherCamera`."""
+        """Move the last pose of the camera."""
         self.tracker.move(T_new_old)
 
 

@@ -9,6 +9,7 @@ from splatbot.config import Config
 from splatbot.frame import Frame
 from splatbot.gaussians import GaussianModel, Snapshot
 from splatbot.geometry import inverse, transform_points
+from splatbot.mapping.further_camera import FurtherCamera
 from splatbot.mapping.refine import Stop, never
 from splatbot.slam import FrameResult, Slam, Verdict
 from splatbot.trajectory import Trajectory
@@ -40,6 +41,11 @@ class OracleSlam(Slam):
         self._reference, self._lost, self._degraded, self._crash_at = reference, lost, degraded, crash_at
         self._points: list[NDArray[np.float64]] = []
         self._colors: list[NDArray[np.float64]] = []
+
+    @property
+    def further_cameras(self) -> dict[str, FurtherCamera]:
+        """There is one camera."""
+        return {}
 
     @property
     def iterations_left(self) -> int:

@@ -24,7 +24,7 @@ SIGMA = (0.02, 0.035)
 
 @cache
 def mapped() -> tuple[SyntheticLog, Slam]:
-    """A map of the table top by the first camera alone."""
+    """Map the table top by the first camera alone."""
     log = wrist_log(24, effects="depth_noise")
     slam = Slam(CONFIG)
     for frame in log:

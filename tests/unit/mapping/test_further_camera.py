@@ -31,7 +31,7 @@ def wrist() -> SyntheticLog:
 
 @cache
 def table_pose() -> NDArray[np.float64]:
-    """T_scene_camera of a fixed camera."""
+    """Return T_scene_camera (4, 4) of a fixed camera."""
     return side_view(wrist(), np.radians(40), 0.1)
 
 

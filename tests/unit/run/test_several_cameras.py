@@ -130,7 +130,7 @@ def test_a_resumed_run_of_several_cameras_is_bit_for_bit_the_uninterrupted_one(
     for frames in (9, 17, 30):  # while the fixed camera is estimated, before and after its keyframe
         resume = SavedRun.load(tmp_path) if frames > 9 else None
         given = {"resume": resume} if resume else {"config": config()}
-        map_log(open_log(rig), out=tmp_path, max_frames=frames, save_every=0.0, report=False, **given)  # type: ignore[arg-type]
+        map_log(open_log(rig), out=tmp_path, max_frames=frames, save_every=0.0, report=False, **given)
     map_log(open_log(rig), out=tmp_path, resume=SavedRun.load(tmp_path), save_every=0.0, report=False)
     for name in ("trajectory.tum", "trajectory-table.tum", "trajectory-head.tum", "map.ply", "config.yaml"):
         assert (tmp_path / name).read_bytes() == (whole / name).read_bytes(), name
