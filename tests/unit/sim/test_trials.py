@@ -236,6 +236,7 @@ def test_wrong_plans_are_named() -> None:
             replace(TrialsPlan(), **values)
 
 
+@pytest.mark.long
 def test_one_thing_is_seen_picked_and_shaken_whatever_another_scan_gave_and_ctrl_c_keeps_it(tmp_path: Path) -> None:
     def stop(what: str, share: float) -> None:
         raise KeyboardInterrupt
