@@ -14,6 +14,7 @@ import numpy as np
 from splatbot.protocols import Array, HandShape, LinkSpheres
 from splatbot.robots.bodies import joined, load_body
 from splatbot.robots.joints import Joint
+from splatbot.robots.link_frames import LinkFrames
 from splatbot.robots.robot import GripperGeometry, Inertial, RobotModel
 from splatbot.robots.shapes import Capsule
 
@@ -100,6 +101,7 @@ def panda() -> RobotModel:
         slack=body.slack,
         covering=joined(*arm_spheres(), body.on("hand", 7, T_LINK_HAND)),
         pairs=np.array(PAIRS, dtype=np.int32),
+        link_frames=LinkFrames(tuple(f"panda_link{k}" for k in range(8)), np.tile(np.eye(4), (8, 1, 1))),
     )
 
 

@@ -14,6 +14,7 @@ from splatbot.geometry import inverse, transform_points
 from splatbot.protocols import Array, HandShape, KinematicChain, LinkSpheres
 from splatbot.robots.cover import cover
 from splatbot.robots.joints import Joint, chain_of
+from splatbot.robots.link_frames import LinkFrames
 from splatbot.robots.shapes import Mesh, Shape
 
 
@@ -101,9 +102,10 @@ class RobotModel:
         covering: spheres of the links. If None, they are generated from the shapes.
         pairs: (M, 2) links that may not touch. If None, they are derived from the spheres.
         visual: visual meshes of links, for pictures alone.
+        link_frames: frames of the links in TF; None if its description does not name them.
 
     Raises:
-        InputError: joints, home and shapes are inconsistent.
+        InputError: joints, home, shapes and frames are inconsistent.
     """
 
     name: str
@@ -118,12 +120,16 @@ class RobotModel:
     covering: LinkSpheres | None = field(default=None, repr=False)
     pairs: NDArray[np.int32] | None = field(default=None, repr=False)
     visual: tuple[Mesh, ...] = field(default=(), repr=False)
+    link_frames: LinkFrames | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         if len(self.home) != len(self.joints):
             raise InputError(f"has {len(self.home)} values for {len(self.joints)} joints.", field="home")
         if any(not 0 <= shape.link <= len(self.joints) for shape in self.shapes):
             raise InputError("names a link that is not there.", field="shapes", hint=f"links are 0..{len(self.joints)}")
+        if self.link_frames is not None and len(self.link_frames.names) != len(self.joints) + 1:
+            problem = f"names {len(self.link_frames.names)} links for {len(self.joints)} joints."
+            raise InputError(problem, field="link_frames", hint="name the base and one link for each joint")
 
     def __len__(self) -> int:
         """Return the number of joints."""

@@ -19,6 +19,7 @@ from splatbot.protocols import HandShape, LinkSpheres
 from splatbot.robots.arms import ARMS, arm_file
 from splatbot.robots.hands import attach, find_hand, panda_2f85, panda_2f140
 from splatbot.robots.joints import Joint
+from splatbot.robots.link_frames import LinkFrames
 from splatbot.robots.panda import panda
 from splatbot.robots.robot import GripperGeometry, Inertial, RobotModel
 from splatbot.robots.shapes import Capsule
@@ -123,6 +124,7 @@ def save_robot(robot: RobotModel, path: Path) -> None:
         "pairs": robot.self_collision_pairs.tolist(),
         "spheres": np.c_[spheres.link, spheres.centers, spheres.radii].tolist(),
         "gripper": _gripper_document(robot),
+        "link_frames": _link_frames_document(robot),
     }
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(path) as file:
@@ -158,6 +160,7 @@ def read_robot(path: Path) -> RobotModel:
             pairs=np.array(d["pairs"], dtype=np.int32).reshape(-1, 2),
             gripper=None if d.get("gripper") is None else _gripper(d["gripper"]),
             visual=load_visual(meshes, len(d["joints"]) + 1) if meshes.is_file() else (),
+            link_frames=None if d.get("link_frames") is None else _link_frames(d["link_frames"]),
         )
     except FormatError:
         raise
@@ -169,6 +172,21 @@ def _joint(j: dict[str, Any]) -> Joint:
     lower, upper, velocity, acceleration, jerk, effort = (float(x) for x in j["limits"])
     T = np.array(j["T_before_joint"], dtype=np.float64).reshape(4, 4)
     return Joint(str(j["name"]), T, lower, upper, velocity, acceleration, jerk, effort, bool(j["prismatic"]))
+
+
+def _link_frames_document(robot: RobotModel) -> list[dict[str, Any]] | None:
+    frames = robot.link_frames
+    if frames is None:
+        return None
+    return [
+        {"name": name, "T_frame_link": T.tolist()} for name, T in zip(frames.names, frames.T_frame_link, strict=True)
+    ]
+
+
+def _link_frames(d: list[dict[str, Any]]) -> LinkFrames:
+    return LinkFrames(
+        tuple(str(frame["name"]) for frame in d), np.array([frame["T_frame_link"] for frame in d], dtype=np.float64)
+    )
 
 
 def _gripper_document(robot: RobotModel) -> dict[str, Any] | None:

@@ -11,9 +11,10 @@ from xml.parsers.expat import ExpatError, ParserCreate
 import numpy as np
 
 from splatbot.errors import FormatError, InputError
-from splatbot.geometry import so3_exp, transform_points
+from splatbot.geometry import inverse, so3_exp, transform_points
 from splatbot.protocols import Array
 from splatbot.robots.joints import Joint
+from splatbot.robots.link_frames import LinkFrames
 from splatbot.robots.maker_meshes import read_shapes
 from splatbot.robots.reading import CONSTANTS, NamedShape, Reading, checked_slack, default_tip, distinct, joint, z_to
 from splatbot.robots.robot import Inertial, RobotModel
@@ -117,6 +118,7 @@ class UrdfReader:
         if not arm:
             raise FormatError("has no moving joint.", file=self.file, field=end, hint="name another link with tip")
         joints: list[Joint] = []
+        turns: list[Array] = []
         placed: dict[str, tuple[int, Array]] = {self.root_link(): (0, np.eye(4))}
         for child, e in self.outwards():
             k, T = placed[self.link(e, "parent")]
@@ -127,9 +129,11 @@ class UrdfReader:
             turn = np.eye(4)
             turn[:3, :3] = z_to(self.axis(e))
             joints.append(self._joint(e, T @ turn))
+            turns.append(turn)
             placed[child] = (k + 1, turn.T)
         shapes = distinct(shape for link, (k, T) in placed.items() for shape in self.shapes(link, k, T))
         slack = checked_slack(shapes, joints, placed[end][1], self.slack, self.file)
+        base = self.link(arm[0], "parent")
         lower, upper = np.array([j.lower for j in joints]), np.array([j.upper for j in joints])
         robot = RobotModel(
             name=self.root.get("name") or self.file.stem,
@@ -139,6 +143,9 @@ class UrdfReader:
             home=np.clip(np.zeros(len(joints)), lower, upper),
             inertials=self._inertials(len(joints), placed),
             slack=slack,
+            link_frames=LinkFrames(
+                (base, *(self.link(e, "child") for e in arm)), np.stack([inverse(placed[base][1]), *turns])
+            ),
         )
         return Reading(robot, tuple(self.notes))
 

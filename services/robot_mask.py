@@ -6,7 +6,7 @@ import bisect
 import logging
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -16,10 +16,9 @@ from splatbot.errors import InputError
 from splatbot.frame import Frame
 from splatbot.geometry import inverse, transform_points
 from splatbot.logs.joints import MAX_GAP, interpolate_joints, select_joints
-from splatbot.mapping.selfmask import REACH, JointsUnknownError
+from splatbot.mapping.selfmask import REACH, JointsUnknownError, SelfMask
 from splatbot.protocols import Array, FrameSource
 from splatbot.robots.in_view import self_mask
-from splatbot.robots.link_frames import link_frames
 from splatbot.robots.robot import RobotModel
 from splatbot.services.ros.robot_topics import RobotTopics
 from splatbot.services.topics import JointState, RosFrame
@@ -131,16 +130,17 @@ class RobotMask:
     A frame with joints of its own is masked by these. Otherwise its joints are those of the history at the frame's
     stamp plus the workspace's ``joint_delay``. Where no joint states come, the poses of the links are those of TF at
     that time. So is the pose of the camera if it is not known on its link; then TF counts alone. A frame without known
-    joints or poses is refused: it must not be mapped.
+    joints or poses is refused: it must not be mapped. So is a frame of a further camera without a workspace of its own.
 
     Args:
         robot: the robot.
         workspace: pose of the camera on its link, and names, offsets and delay of the joints.
         topics: transforms and attached objects; those of a recording are not of its frames.
         camera_in_tf: the pose of the camera may be missing in the workspace.
+        further: workspaces of further cameras by name, each with the pose of its camera on a link.
 
     Raises:
-        InputError: the pose of the camera is unknown, or the workspace does not fit the robot.
+        InputError: the pose of a camera is unknown, or a workspace does not fit the robot.
     """
 
     def __init__(
@@ -150,14 +150,19 @@ class RobotMask:
         topics: RobotTopics | None = None,
         *,
         camera_in_tf: bool = False,
+        further: Mapping[str, Workspace] | None = None,
     ) -> None:
         self.robot, self._workspace, self._camera_in_tf = robot, workspace or Workspace(), camera_in_tf
+        self._workspaces = {"": self._workspace, **(further or {})}
         self.topics = topics
         self.history = JointHistory(self._workspace.joint_names or robot.chain.names)
-        self._frames = link_frames(robot, self._workspace.joint_names)
+        frames = robot.link_frames
+        self._frames = None if frames is None else frames.prefixed(self._workspace.tf_prefix)
         self.masked = 0
         self.refused = 0
         self.problem: str | None = None
+        self.problems: dict[str, str] = {}
+        """Reasons why the latest frames of cameras were refused, by the name of the camera."""
         self._reported = -np.inf
         self._given = np.zeros((0, 4))
         self._attached, self._version = np.zeros((0, 4)), 0
@@ -187,39 +192,55 @@ class RobotMask:
                 if abs(frame.depth_delay) > _SAME_TIME_S:
                     masked = self._masked_at(masked, frame.depth_delay)
             else:
-                masked = self._mask(frame)
+                masked = self._mask_of(frame)(frame)
         except JointsUnknownError as error:
-            self._refuse(error)
+            self._refuse(frame.camera_name, error)
             raise
         self.masked, self.problem = self.masked + 1, None
+        self.problems.pop(frame.camera_name, None)
         return masked
+
+    def _mask_of(self, frame: Frame) -> SelfMask:
+        """Return the mask for the camera of a frame.
+
+        Raises:
+            JointsUnknownError: its pose on the robot is not known.
+        """
+        found = self._masks.get(frame.camera_name)
+        if found is None:
+            raise JointsUnknownError(
+                f"the mount of camera {frame.camera_name} is not known, so {self.robot.name} cannot be masked.",
+                field="camera_name",
+                hint="describe it by T_link_camera and camera_link",
+            )
+        return found
 
     def _masked_at(self, frame: Frame, after: float) -> Frame:
         """Return the frame with the robot masked as it is at a time [s] after the frame's stamp."""
+        mask, fixed = self._mask_of(frame), self._workspaces[frame.camera_name].T_link_camera is not None
         delay = after + self.joint_delay
         stamp, wait_s = frame.stamp + delay, _WAIT_S + max(delay, 0.0)
         come = self.history.reaches(stamp - wait_s)
-        if self._workspace.T_link_camera is None or (self._has_transforms and not come):
-            return self._mask.at_poses(frame, *self._poses(frame, stamp, wait_s))
+        if not fixed or (self._has_transforms and not come):
+            return mask.at_poses(frame, *self._poses(frame, stamp, wait_s, fixed=fixed))
         q = self.history.at(stamp, wait_s)
-        return self._mask(replace(frame, joints=q, joint_names=self.history.names))
+        return mask(replace(frame, joints=q, joint_names=self.history.names))
 
     @property
     def _has_transforms(self) -> bool:
         return self.topics is not None and self._frames is not None and len(self.topics.transforms) > 0
 
-    def _poses(self, frame: Frame, stamp: float, wait_s: float) -> tuple[Array, Array | None]:
+    def _poses(self, frame: Frame, stamp: float, wait_s: float, *, fixed: bool) -> tuple[Array, Array | None]:
         """Return the poses (J + 1, 4, 4) of the links at a stamp [s] by TF, and that of the camera.
 
-        Both are in the frame of the camera. If the workspace has the camera's pose on its link, the first are in the
-        frame of the base, and the second is None.
+        Both are in the frame of the camera. If the camera is ``fixed`` on its link by the workspace, the first are in
+        the frame of the base, and the second is None.
         """
         if self.topics is None or self._frames is None:
-            hint = "publish joint states, and write T_link_camera to scene.yaml"
+            hint = "add it again: splatbot robot add FILE.urdf --overwrite, or publish its joint states"
             raise JointsUnknownError(
-                f"the links of {self.robot.name} have no known names in TF.", field="tf", hint=hint
+                f"TF cannot mask {self.robot.name}: its stored file does not name its links.", field="tf", hint=hint
             )
-        fixed = self._workspace.T_link_camera is not None
         target = self._frames.names[0] if fixed else frame.camera_frame if isinstance(frame, RosFrame) else ""
         if not target:
             hint = "set header.frame_id of the images, or write T_link_camera to scene.yaml"
@@ -269,12 +290,11 @@ class RobotMask:
             self._version = -1  # the attached objects share the number of spheres
 
     def _build(self) -> None:
-        self._mask = self_mask(
-            self.robot,
-            self._workspace,
-            held=np.concatenate([self._given, self._attached]),
-            needs_camera=not self._camera_in_tf,
-        )
+        held = np.concatenate([self._given, self._attached])
+        self._masks = {
+            name: self_mask(self.robot, workspace, held=held, needs_camera=bool(name) or not self._camera_in_tf)
+            for name, workspace in self._workspaces.items()
+        }
 
     def _hold_attached(self) -> None:
         """Mask the objects that are attached now to the last link, or to a frame that it carries.
@@ -315,8 +335,9 @@ class RobotMask:
         hint = "publish its TF, or attach the object to the last link"
         raise JointsUnknownError(f"the link {link} of attached {name[:40]!r} is not known.", field="tf", hint=hint)
 
-    def _refuse(self, error: JointsUnknownError) -> None:
+    def _refuse(self, camera_name: str, error: JointsUnknownError) -> None:
         self.refused, self.problem = self.refused + 1, error.message
+        self.problems[camera_name] = error.message
         if time.monotonic() - self._reported >= _REPORT_S:
             self._reported = time.monotonic()
             _log.warning(

@@ -13,7 +13,7 @@ from splatbot.errors import InputError
 from splatbot.geometry import pose_from_quat
 from splatbot.planning.timing import DEFAULT_SPEED
 from splatbot.services.arrays import Configurations, Points
-from splatbot.workspace import MAX_JOINT_DELAY_S, Workspace
+from splatbot.workspace import MAX_JOINT_DELAY_S, MAX_PREFIX, Workspace
 
 Vector3 = tuple[float, float, float]
 Vector4 = tuple[float, float, float, float]
@@ -116,6 +116,9 @@ class RobotInView(Request):
     joint_names: list[str] = Field(
         [], max_length=MAX_JOINTS, description="names of the joints in joint states; default: those of the model"
     )
+    tf_prefix: str = Field(
+        "", max_length=MAX_PREFIX, description="prefix of the names of the robot's links in TF, as left_"
+    )
 
     def workspace(self, known: Workspace | None) -> Workspace | None:
         """Return the workspace with the given values; the others are those of the known one.
@@ -137,7 +140,7 @@ class RobotMaskInfo(BaseModel):
 
     name: str = Field(description="robot")
     masked: int = Field(description="frames whose pixels of the robot are masked")
-    refused: int = Field(description="frames that are not mapped, because joint states were missing or stale")
+    refused: int = Field(description="frames that are not mapped, because joint states, or TF, were missing or stale")
     problem: str | None = Field(None, description="why the latest frame was refused; null if it was masked")
 
 

@@ -20,6 +20,8 @@ Array = NDArray[np.float64]
 
 NAME = "scene.yaml"
 MAX_JOINT_DELAY_S = 1.0
+MAX_PREFIX = 128
+"""Longest prefix of names in TF [characters]."""
 _KEYS = (
     "T_world_base",
     "gravity",
@@ -31,6 +33,7 @@ _KEYS = (
     "joint_offsets",
     "joint_delay",
     "joint_names",
+    "tf_prefix",
 )
 
 
@@ -88,9 +91,11 @@ class Workspace:
         joint_offsets: (J,) offsets to be added to measured joint positions [rad or m].
         joint_delay: time [s] by which the stamps of measured joint positions are later than the motion.
         joint_names: (J,) names of the robot's joints in recordings, if they are not those of its model.
+        tf_prefix: prefix of the names of the robot's links in TF, as ``left_``.
 
     Raises:
-        InputError: a value has a wrong shape, is not finite, or is no rigid pose, no unit vector or an empty box.
+        InputError: a value has a wrong shape, is not finite, or is no rigid pose, no unit vector, no prefix or an empty
+            box.
     """
 
     T_world_base: Array | None = None
@@ -103,6 +108,7 @@ class Workspace:
     joint_offsets: Array | None = None
     joint_delay: float = 0.0
     joint_names: tuple[str, ...] = ()
+    tf_prefix: str = ""
 
     def __post_init__(self) -> None:
         _check("T_world_base", self.T_world_base, (4, 4), "a pose")
@@ -123,6 +129,9 @@ class Workspace:
         if not abs(self.joint_delay) <= MAX_JOINT_DELAY_S:
             hint = f"give seconds, at most {MAX_JOINT_DELAY_S:g}"
             raise InputError(f"is {self.joint_delay}.", field="joint_delay", hint=hint)
+        if not isinstance(self.tf_prefix, str) or self.tf_prefix.startswith("/") or len(self.tf_prefix) > MAX_PREFIX:
+            hint = f"give at most {MAX_PREFIX} characters without a leading slash, as left_ or left/"
+            raise InputError(f"is {str(self.tf_prefix)[:40]!r}.", field="tf_prefix", hint=hint)
         if not isinstance(self.camera_link, int) or isinstance(self.camera_link, bool):
             raise InputError(
                 f"is {self.camera_link!r}.", field="camera_link", hint="give a link's number, -1: the last"
@@ -154,6 +163,7 @@ class Workspace:
                 joint_offsets=_array(found.get("joint_offsets"), "joint_offsets"),
                 joint_delay=_number(found.get("joint_delay", 0.0), "joint_delay"),
                 joint_names=_names(found.get("joint_names", [])),
+                tf_prefix=found.get("tf_prefix", ""),
             )
         except InputError as error:
             raise FormatError(error.message, file=path, field=error.field, hint=error.hint) from error
@@ -176,6 +186,8 @@ class Workspace:
             document["joint_delay"] = round(self.joint_delay, 6)
         if self.joint_names:
             document["joint_names"] = list(self.joint_names)
+        if self.tf_prefix:
+            document["tf_prefix"] = self.tf_prefix
         if self.objects:
             document["objects"] = [
                 {"name": o.name, "at": _plain(o.at)} | ({"aliases": list(o.aliases)} if o.aliases else {})

@@ -187,7 +187,7 @@ class TransformBuffer:
         missing = [name for name in (target, *lost) if name not in frames]
         if missing:
             like = sorted(name for name in frames if any(name.endswith(lack) for lack in missing))
-            hint = f"there are {', '.join(like[:9])}: give joint_names that prefix" if like else _NO_TF
+            hint = f"there are {', '.join(like[:9])}: give that tf_prefix" if like else _NO_TF
             return JointsUnknownError(f"TF has no frame {', '.join(missing)}.", field="tf", hint=hint)
         hint = "publish the transforms between them, also on /tf_static"
         return JointsUnknownError(f"TF does not connect {', '.join(lost)} with {target}.", field="tf", hint=hint)

@@ -271,6 +271,7 @@ def _info(name: str) -> None:
             ("home", " ".join(f"{value:.4g}" for value in model.home)),
             ("gripper", _gripper_text(model)),
             ("tool (TCP)", _tool_text(model)),
+            ("links in TF", _links_text(model)),
             *([("mass", f"last link with its hand {model.inertials[-1].mass:.3g} kg")] if model.inertials else []),
         ]
     )
@@ -281,6 +282,11 @@ def _gripper_text(model: RobotModel) -> str:
     if gripper is None:
         return "none"
     return f"opens {2 * gripper.stroke:g} m, {gripper.force:g} N, {gripper.speed:g} m/s each finger"
+
+
+def _links_text(model: RobotModel) -> str:
+    frames = model.link_frames
+    return "no names: add its URDF again" if frames is None else ", ".join(frames.names)
 
 
 def _tool_text(model: RobotModel) -> str:

@@ -132,10 +132,18 @@ def test_things_without_name_or_place_are_refused(text: str, tmp_path: Path) -> 
 
 
 def test_the_scene_of_a_log_is_found_by_its_address_with_options(tmp_path: Path) -> None:
-    Workspace(camera_link=0, T_link_camera=np.eye(4), joint_delay=0.05).save(tmp_path / NAME)
+    Workspace(camera_link=0, T_link_camera=np.eye(4), joint_delay=0.05, tf_prefix="left_").save(tmp_path / NAME)
     (tmp_path / "a.mcap").touch()
     for address in (f"{tmp_path}/a.mcap?color=/wrist/image_raw", f"{tmp_path}?tolerance=0.05", tmp_path):
         found = find_workspace(address)
         assert found is not None
         assert found.joint_delay == 0.05
+        assert found.tf_prefix == "left_"
     assert find_workspace("synthetic:tabletop?" + "effects=a;" * 1000) is None
+
+
+@pytest.mark.parametrize("text", ["/left", "3", "[left_]", "a" * 129])
+def test_a_prefix_of_tf_that_no_frame_can_have_is_refused(text: str, tmp_path: Path) -> None:
+    (tmp_path / "scene.yaml").write_text(f"tf_prefix: {text}\n")
+    with pytest.raises(FormatError, match="tf_prefix"):
+        Workspace.load(tmp_path / "scene.yaml")

@@ -22,7 +22,9 @@ def test_a_robot_is_added_checked_listed_and_described(
     assert names[:3] == ["panda", "panda-2f85", "panda-2f140"]
     assert names[-1] == "ur5"
     assert {"ur5e", "ur5e-2f85", "xarm7", "iiwa14", "so100"} <= set(names)
-    assert "shoulder_pan" in run("robot", "info", "ur5").out
+    info = run("robot", "info", "ur5").out
+    assert "shoulder_pan" in info
+    assert "base, shoulder_pan_link, shoulder_lift_link, elbow_link, wrist_1_link, wrist_2_link, wrist_3_link" in info
     refused = run("robot", "mjcf", "ur5")
     assert refused.code == 2
     assert "has no inertias" in refused.err

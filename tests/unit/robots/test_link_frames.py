@@ -1,20 +1,24 @@
-"""Frames of shipped robots' links, against the descriptions of their makers."""
+"""Frames of robots' links in TF, against the descriptions of their makers."""
 
 from __future__ import annotations
 
+import json
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from splatbot.errors import FormatError, InputError
 from splatbot.protocols import Array
 from splatbot.robots.arms import ARMS, description_of
-from splatbot.robots.link_frames import link_frames
+from splatbot.robots.link_frames import LinkFrames
 from splatbot.robots.maker_meshes import Source
 from splatbot.robots.panda import panda
-from splatbot.robots.store import load_robot, robot_names
+from splatbot.robots.store import load_robot, read_robot, robot_names, save_robot
+from splatbot.robots.urdf import read_urdf
 
 
 def matrix(translation: Array, rotation: Rotation) -> Array:
@@ -64,31 +68,100 @@ def test_links_of_shipped_arms_are_where_their_makers_description_has_them(name:
     robot = load_robot(name)
     q = robot.random(1, np.random.default_rng(1))[0]
     expected = frames_of_urdf(path.read_bytes(), dict(zip(robot.chain.names, q, strict=True)))
-    frames = link_frames(robot)
+    frames = robot.link_frames
     assert frames is not None
-    T_base = np.linalg.inv(expected[frames.names[0]])
+    T_base = np.linalg.inv(expected[frames.names[0]] @ frames.T_frame_link[0])
     for frame, T, T_base_link in zip(frames.names, frames.T_frame_link, robot.fk(q), strict=True):
         np.testing.assert_allclose(T_base @ expected[frame] @ T, T_base_link, atol=1e-6)
 
 
-def test_every_shipped_robot_has_a_frame_for_each_link_and_an_added_one_has_no_names() -> None:
-    for name in robot_names():
+def test_every_shipped_robot_has_a_frame_for_each_link() -> None:
+    for name in shipped():
         robot = load_robot(name)
-        frames = link_frames(robot)
+        frames = robot.link_frames
         assert frames is not None
         assert len(frames.names) == len(set(frames.names)) == len(frames.T_frame_link) == len(robot) + 1
-    assert link_frames(replace(panda(), name="panda-mine")) is None
 
 
-@pytest.mark.parametrize("prefix", ["", "left_", "left/"])
-def test_names_have_the_prefix_of_the_joints(prefix: str) -> None:
-    frames = link_frames(panda(), [f"{prefix}{name}" for name in panda().chain.names])
+def shipped() -> list[str]:
+    return [name for name in robot_names() if name.partition("-")[0] in ("panda", *ARMS)]
+
+
+AXES = {"shoulder": "0 0 1", "slide": "0.6 0 0.8", "wrist": "0 -1 0"}
+
+
+def arm_on_a_cart(folder: Path) -> Path:
+    """Write an arm whose joints have skew axes and whose base is turned on a cart, with a camera mast next to it."""
+    shape = '<collision><geometry><box size="0.05 0.05 0.4"/></geometry></collision>'
+    parts = ['<robot name="cart"><link name="world"/>', *(f'<link name="{n}">{shape}</link>' for n in ("cart", "foot"))]
+    parts.append('<joint name="a" type="fixed"><parent link="world"/><child link="cart"/></joint>')
+    parts.append(
+        '<joint name="b" type="fixed"><parent link="cart"/><child link="foot"/><origin xyz="0.3 0.1 0.5" '
+        'rpy="0 0.2 3"/></joint><link name="mast"/><joint name="c" type="fixed"><parent link="cart"/>'
+        '<child link="mast"/></joint>'
+    )
+    before = "foot"
+    for name, axis in AXES.items():
+        kind = "prismatic" if name == "slide" else "revolute"
+        parts.append(
+            f'<link name="{name}_link">{shape}</link><joint name="{name}" type="{kind}"><parent link="{before}"/>'
+            f'<child link="{name}_link"/><origin xyz="0.05 0.02 0.3" rpy="0.3 -0.2 0.1"/><axis xyz="{axis}"/>'
+            '<limit lower="-0.5" upper="0.5" velocity="1" effort="10"/></joint>'
+        )
+        before = f"{name}_link"
+    path = folder / "cart.urdf"
+    path.write_text("".join([*parts, "</robot>"]))
+    return path
+
+
+def poses_on_the_cart(q: Array) -> dict[str, Array]:
+    """Compute the poses of links in the world with scipy from the numbers of :func:`arm_on_a_cart`."""
+    T = matrix(np.array([0.3, 0.1, 0.5]), Rotation.from_euler("xyz", [0.0, 0.2, 3.0]))
+    found = {"foot": T}
+    for (name, axis), value in zip(AXES.items(), q, strict=True):
+        T = T @ matrix(np.array([0.05, 0.02, 0.3]), Rotation.from_euler("xyz", [0.3, -0.2, 0.1]))
+        along = value * np.array(axis.split(), float)
+        slide = name == "slide"
+        T = T @ matrix(along if slide else np.zeros(3), Rotation.from_rotvec(np.zeros(3) if slide else along))
+        found[f"{name}_link"] = T
+    return found
+
+
+def test_an_added_robot_keeps_the_links_of_its_urdf_and_their_places_in_its_file(tmp_path: Path) -> None:
+    save_robot(read_urdf(arm_on_a_cart(tmp_path), slack=0.05).robot, tmp_path / "cart.json")
+    robot = read_robot(tmp_path / "cart.json")
+    frames, q = robot.link_frames, np.array([0.4, -0.3, 0.2])
     assert frames is not None
-    assert frames.names == tuple(f"{prefix}panda_link{k}" for k in range(8))
+    assert frames.names == ("foot", "shoulder_link", "slide_link", "wrist_link")
+    expected = poses_on_the_cart(q)
+    for name, T, T_root_link in zip(frames.names, frames.T_frame_link, robot.fk(q), strict=True):
+        np.testing.assert_allclose(expected[name] @ T, T_root_link, atol=1e-12)
 
 
-@pytest.mark.parametrize("names", [(), ("a",), tuple("abcdefg"), ("x_panda_joint1", *panda().chain.names[1:])])
-def test_joints_with_other_names_give_no_prefix(names: tuple[str, ...]) -> None:
-    frames = link_frames(panda(), names)
+def test_a_robot_of_an_earlier_version_loads_without_names(tmp_path: Path) -> None:
+    path = tmp_path / "mine.json"
+    save_robot(panda(), path)
+    document = json.loads(path.read_text())
+    del document["link_frames"]
+    path.write_text(json.dumps(document))
+    assert read_robot(path).link_frames is None
+    document["link_frames"] = [{"name": "a", "T_frame_link": np.eye(4).tolist()}]
+    path.write_text(json.dumps(document))
+    with pytest.raises(FormatError, match="names 1 links for 7 joints"):
+        read_robot(path)
+
+
+def test_a_robot_with_another_hand_or_name_keeps_its_links() -> None:
+    for robot in (load_robot("panda-2f85"), replace(panda(), name="lab")):
+        assert robot.link_frames is panda().link_frames
+
+
+def test_a_prefix_stands_before_every_name_and_names_differ() -> None:
+    frames = panda().link_frames
     assert frames is not None
-    assert frames.names[0] == "panda_link0"
+    assert frames.prefixed("left/").names == tuple(f"left/panda_link{k}" for k in range(8))
+    np.testing.assert_array_equal(frames.prefixed("left/").T_frame_link, frames.T_frame_link)
+    with pytest.raises(InputError, match="repeats one of a, a"):
+        LinkFrames(("a", "a"), np.tile(np.eye(4), (2, 1, 1)))
+    with pytest.raises(InputError, match=r"is \(2, 4, 4\)"):
+        LinkFrames(("a",), np.tile(np.eye(4), (2, 1, 1)))

@@ -197,8 +197,7 @@ def from_ros(frame: Frame, camera_frame: str = "optical") -> RosFrame:
 @pytest.mark.parametrize("prefix", ["", "left_"])
 def test_a_frame_is_masked_by_tf_alone_with_delay_and_prefix(delay: float, prefix: str) -> None:
     log, topics = static_log(2.0), RobotTopics()
-    names = tuple(prefix + name for name in panda().chain.names)
-    mask = RobotMask(panda(), Workspace(joint_delay=delay, joint_names=names), topics, camera_in_tf=True)
+    mask = RobotMask(panda(), Workspace(joint_delay=delay, tf_prefix=prefix), topics, camera_in_tf=True)
     publish_arm(topics, np.arange(0.0, 2.5, 0.02), delay=delay, prefix=prefix)
     with_camera(topics, f"{prefix}panda_link0")
     found, expected = mask(from_ros(log[4])), SelfMask(panda(), T_BASE_STATIC_CAMERA, link=0).usable(log[4])
@@ -269,9 +268,10 @@ def test_links_that_do_not_fit_the_model_are_refused() -> None:
     topics.transforms.add([stamped("panda_link3", "panda_link4", 0.0, longer, static=True)])
     with pytest.raises(JointsUnknownError, match=r"panda_link4 in TF is .* from the model of panda"):
         mask(from_ros(log[2]))
-    added = RobotMask(replace(load_robot("panda"), name="mine"), None, topics, camera_in_tf=True)
-    with pytest.raises(JointsUnknownError, match="links of mine have no known names"):
-        added(from_ros(log[2]))
+    nameless = replace(load_robot("panda"), name="mine", link_frames=None)
+    with pytest.raises(JointsUnknownError, match="TF cannot mask mine") as raised:
+        RobotMask(nameless, None, topics, camera_in_tf=True)(from_ros(log[2]))
+    assert "splatbot robot add" in str(raised.value.hint)
 
 
 def attach(topics: RobotTopics, link: str, *, name: str = "box", size: float = 0.3, operation: int = 0) -> None:
