@@ -16,12 +16,14 @@ from splatbot.errors import InputError
 from splatbot.frame import Frame
 from splatbot.geometry import inverse, transform_points
 from splatbot.logs.joints import MAX_GAP, interpolate_joints, select_joints
-from splatbot.mapping.selfmask import REACH, JointsUnknownError, SelfMask
+from splatbot.mapping.selfmask import JointsUnknownError, SelfMask
 from splatbot.protocols import Array, FrameSource
 from splatbot.robots.in_view import self_mask
+from splatbot.robots.link_poses import LinkPoses
 from splatbot.robots.robot import RobotModel
+from splatbot.robots.tf_buffer import TransformBuffer
 from splatbot.services.ros.robot_topics import RobotTopics
-from splatbot.services.topics import JointState, RosFrame
+from splatbot.services.topics import JointState
 from splatbot.workspace import Workspace
 
 MAX_HELD = 64
@@ -30,7 +32,6 @@ _KEPT_S = 10.0  # [s] of joint states
 _SET_BACK_S = 0.5  # [s] by which a state may be older than the newest one
 _KEPT = 20_000  # joint states: 2 kHz over that time
 _WAIT_S = 0.15  # [s] for the joint state after an image
-_TILT = 0.05  # [rad] by which the axis of a joint in TF may differ from the model
 _SAME_TIME_S = 1e-3  # [s] between colour and depth in which an arm moves by less than the noise of depth
 _REPORT_S = 10.0  # [s] between two warnings about frames that are not mapped
 
@@ -154,10 +155,10 @@ class RobotMask:
     ) -> None:
         self.robot, self._workspace, self._camera_in_tf = robot, workspace or Workspace(), camera_in_tf
         self._workspaces = {"": self._workspace, **(further or {})}
-        self.topics = topics
+        self._topics = topics
+        transforms = TransformBuffer() if topics is None else topics.transforms
+        self._link_poses = LinkPoses(robot, transforms, self._workspace.tf_prefix)
         self.history = JointHistory(self._workspace.joint_names or robot.chain.names)
-        frames = robot.link_frames
-        self._frames = None if frames is None else frames.prefixed(self._workspace.tf_prefix)
         self.masked = 0
         self.refused = 0
         self.problem: str | None = None
@@ -217,56 +218,13 @@ class RobotMask:
 
     def _masked_at(self, frame: Frame, after: float) -> Frame:
         """Return the frame with the robot masked as it is at a time [s] after the frame's stamp."""
-        mask, fixed = self._mask_of(frame), self._workspaces[frame.camera_name].T_link_camera is not None
-        delay = after + self.joint_delay
+        mask, delay = self._mask_of(frame), after + self.joint_delay
         stamp, wait_s = frame.stamp + delay, _WAIT_S + max(delay, 0.0)
         come = self.history.reaches(stamp - wait_s)
-        if not fixed or (self._has_transforms and not come):
-            return mask.at_poses(frame, *self._poses(frame, stamp, wait_s, fixed=fixed))
+        if not mask.has_camera or (self._link_poses and not come):
+            return self._link_poses.mask(mask, frame, stamp, wait_s)
         q = self.history.at(stamp, wait_s)
         return mask(replace(frame, joints=q, joint_names=self.history.names))
-
-    @property
-    def _has_transforms(self) -> bool:
-        return self.topics is not None and self._frames is not None and len(self.topics.transforms) > 0
-
-    def _poses(self, frame: Frame, stamp: float, wait_s: float, *, fixed: bool) -> tuple[Array, Array | None]:
-        """Return the poses (J + 1, 4, 4) of the links at a stamp [s] by TF, and that of the camera.
-
-        Both are in the frame of the camera. If the camera is ``fixed`` on its link by the workspace, the first are in
-        the frame of the base, and the second is None.
-        """
-        if self.topics is None or self._frames is None:
-            hint = "add it again: splatbot robot add FILE.urdf --overwrite, or publish its joint states"
-            raise JointsUnknownError(
-                f"TF cannot mask {self.robot.name}: its stored file does not name its links.", field="tf", hint=hint
-            )
-        target = self._frames.names[0] if fixed else frame.camera_frame if isinstance(frame, RosFrame) else ""
-        if not target:
-            hint = "set header.frame_id of the images, or write T_link_camera to scene.yaml"
-            raise JointsUnknownError("the images name no frame of their camera.", field="frame_id", hint=hint)
-        T_target_frame = self.topics.transforms.poses(target, self._frames.names, stamp, wait_s)
-        T = T_target_frame @ self._frames.T_frame_link
-        self._check_model(T)
-        return T, None if fixed else np.eye(4)
-
-    def _check_model(self, T: Array) -> None:
-        """Check that links at poses (J + 1, 4, 4) are where a joint of the model can move them.
-
-        Raises:
-            JointsUnknownError: a link is more than 2 cm away, or the axis of its joint is tilted.
-        """
-        assert self._frames is not None
-        for k, joint in enumerate(self.robot.joints):
-            moved = inverse(T[k] @ joint.T_before_joint) @ T[k + 1]
-            away = float(np.linalg.norm(moved[: 2 if joint.prismatic else 3, 3]))
-            if away > REACH or moved[2, 2] < np.cos(_TILT):
-                name, tilt = self._frames.names[k + 1], float(np.arccos(np.clip(moved[2, 2], -1.0, 1.0)))
-                raise JointsUnknownError(
-                    f"{name} in TF is {100 * away:.1f} cm and {tilt:.2f} rad from the model of {self.robot.name}.",
-                    field="tf",
-                    hint="name the robot that publishes TF, or publish its joint states",
-                )
 
     def hold(self, spheres: ArrayLike) -> None:
         """Mask an object in the hand from the next frame on, in addition to the attached ones of MoveIt.
@@ -302,13 +260,13 @@ class RobotMask:
         Raises:
             JointsUnknownError: the link of an object is not known, or there are too many shapes.
         """
-        if self.topics is None or self.topics.attached.version == self._version:
+        if self._topics is None or self._topics.attached.version == self._version:
             return
         with self._building:
-            version = self.topics.attached.version
+            version = self._topics.attached.version
             solids = [
                 (T_last_link, solid)
-                for name, one in self.topics.attached.objects.items()
+                for name, one in self._topics.attached.objects.items()
                 if (T_last_link := self._on_last_link(name, one.link)) is not None
                 for solid in one.solids
             ]
@@ -324,8 +282,7 @@ class RobotMask:
 
     def _on_last_link(self, name: str, link: str) -> Array | None:
         """Return T_last_link (4, 4) of a link that the last link carries; None if another link carries it."""
-        assert self.topics is not None
-        transforms, frames = self.topics.transforms, self._frames
+        transforms, frames = self._link_poses.transforms, self._link_poses.frames
         if frames is not None and (carrier := transforms.carrier(link, frames.names)) is not None:
             if carrier != frames.names[-1]:
                 return None

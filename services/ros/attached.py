@@ -13,7 +13,7 @@ from splatbot.errors import InputError
 from splatbot.geometry import pose_from_quat, transform_points
 from splatbot.logs.ros_types import Message
 from splatbot.protocols import Array
-from splatbot.services.ros.tf_buffer import TransformBuffer
+from splatbot.robots.tf_buffer import TransformBuffer
 
 MAX_SOLIDS = 64
 """Largest number of shapes of an attached object."""

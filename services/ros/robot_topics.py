@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
-from splatbot.logs.ros_frames import seconds_of
+from splatbot.logs.ros_transforms import TF, TF_STATIC, transforms_of
 from splatbot.logs.ros_types import Message
+from splatbot.robots.tf_buffer import TransformBuffer
 from splatbot.services.ros.attached import AttachedObjects
 from splatbot.services.ros.moveit_types import ATTACHED_TYPE, SCENE_TYPE
-from splatbot.services.ros.tf_buffer import StampedTransform, TransformBuffer
 
-TF, TF_STATIC = "/tf", "/tf_static"
 ATTACHED, SCENE = "/attached_collision_object", "/monitored_planning_scene"
 TYPES_OF_ROBOT = {
     TF: "tf2_msgs/msg/TFMessage",
@@ -39,21 +36,8 @@ class RobotTopics:
             InputError: an attached object cannot be covered or placed.
         """
         if topic in (TF, TF_STATIC):
-            self.transforms.add(_transforms(message, static=topic == TF_STATIC))
+            self.transforms.add(transforms_of(message, static=topic == TF_STATIC))
         elif topic == ATTACHED:
             self.attached.take_object(message)
         else:
             self.attached.take_scene(message)
-
-
-def _transforms(message: Message, *, static: bool) -> Iterator[StampedTransform]:
-    for one in message.transforms:
-        t, q = one.transform.translation, one.transform.rotation
-        yield StampedTransform(
-            one.header.frame_id.strip("/"),
-            one.child_frame_id.strip("/"),
-            seconds_of(one.header.stamp),
-            (t.x, t.y, t.z),
-            (q.w, q.x, q.y, q.z),
-            static,
-        )

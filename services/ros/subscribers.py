@@ -13,7 +13,7 @@ from splatbot.errors import SplatbotError
 from splatbot.frame import Frame
 from splatbot.logs.index import MAX_STAMP_DIFFERENCE_S
 from splatbot.logs.mcap import COLOR, DEPTH, INFO, JOINTS
-from splatbot.logs.ros_frames import camera_of, color_of, depth_of, seconds_of, size_of
+from splatbot.logs.ros_frames import RosFrame, camera_of, color_of, depth_of, seconds_of, size_of
 from splatbot.logs.ros_types import Message
 from splatbot.logs.undistort import Undistorter
 from splatbot.services.bus import Subscription
@@ -25,7 +25,7 @@ from splatbot.services.ros.publishers import FROM_ROS
 from splatbot.services.ros.robot_topics import TYPES_OF_ROBOT
 from splatbot.services.ros.wire import RosMessage
 from splatbot.services.threads import join_started
-from splatbot.services.topics import JointState, RosFrame
+from splatbot.services.topics import JointState
 
 MAX_PIXELS = 2_100_000  # of an image, unless the settings of the service say otherwise
 _WAITING = 16

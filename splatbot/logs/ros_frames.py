@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field
 from typing import Any
 
 import cv2
@@ -11,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from splatbot.camera import Camera
 from splatbot.errors import CameraError, InputError
+from splatbot.frame import Frame
 from splatbot.geometry import pose_from_quat, rotation_to_quat
 from splatbot.logs.image_size import image_size
 from splatbot.logs.ros_types import Message, build
@@ -20,6 +22,17 @@ DEPTH_ENCODINGS = ("16UC1", "mono16", "32FC1")
 _MILLIMETRES = 1000.0  # of 16UC1 and mono16 (REP 118)
 _COMPRESSED_DEPTH_HEADER = 12  # bytes before the PNG: format and two quantisation parameters, used by 32FC1 alone
 _NANO = 10**9
+
+
+@dataclass(frozen=True, eq=False)
+class RosFrame(Frame):
+    """A frame of a ROS camera.
+
+    Args:
+        camera_frame: name of the optical frame of the camera in TF.
+    """
+
+    camera_frame: str = field(default="", kw_only=True)
 
 
 def to_nanoseconds(stamp: float) -> int:

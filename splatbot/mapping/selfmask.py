@@ -81,6 +81,11 @@ class SelfMask:
         self._T_link_camera, self._link, self._reach = T, link % links, reach
         self._radii = self._arm.spheres.radii + reach
 
+    @property
+    def has_camera(self) -> bool:
+        """Return whether the pose of the camera on its link is known."""
+        return self._T_link_camera is not None
+
     def __call__(self, frame: Frame) -> Frame:
         """Return the frame with the robot removed from its mask.
 

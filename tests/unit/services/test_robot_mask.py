@@ -12,6 +12,8 @@ import pytest
 from splatbot.errors import InputError
 from splatbot.frame import Frame
 from splatbot.geometry import inverse, rotation_to_quat
+from splatbot.logs.ros_frames import RosFrame
+from splatbot.logs.ros_transforms import StampedTransform
 from splatbot.logs.ros_types import build
 from splatbot.mapping.selfmask import JointsUnknownError, SelfMask
 from splatbot.protocols import Array
@@ -20,8 +22,7 @@ from splatbot.robots.store import load_robot
 from splatbot.services.robot_mask import JointHistory, MaskedSource, RobotMask
 from splatbot.services.ros.moveit_types import ATTACHED_TYPE, register_moveit_types
 from splatbot.services.ros.robot_topics import RobotTopics
-from splatbot.services.ros.tf_buffer import StampedTransform
-from splatbot.services.topics import JointState, RosFrame
+from splatbot.services.topics import JointState
 from splatbot.workspace import Workspace
 from tests.swept_arm import T_BASE_STATIC_CAMERA, static_log, sweep
 

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from splatbot.errors import InputError
+from splatbot.logs.ros_transforms import StampedTransform
 from splatbot.logs.ros_types import Message, build, from_cdr, to_cdr
+from splatbot.robots.tf_buffer import TransformBuffer
 from splatbot.services.ros.attached import MAX_SOLIDS, AttachedObjects
 from splatbot.services.ros.moveit_types import ATTACHED_TYPE, SCENE_TYPE, register_moveit_types
-from splatbot.services.ros.tf_buffer import StampedTransform, TransformBuffer
 
 Array = NDArray[np.float64]
 ADD, REMOVE, APPEND = 0, 1, 2

@@ -18,7 +18,7 @@ from splatbot.gaussians import GaussianModel, Snapshot
 from splatbot.geometry import look_at, pose_from_quat
 from splatbot.logs import open_log
 from splatbot.logs.mcap import COLOR, DEPTH, INFO, JOINTS
-from splatbot.logs.ros_frames import camera_info_message, image_message, pose_of
+from splatbot.logs.ros_frames import RosFrame, camera_info_message, image_message, pose_of
 from splatbot.logs.ros_types import build, from_cdr, to_cdr, to_plain
 from splatbot.services.ros.graph import RosGraph
 from splatbot.services.ros.messages import (
@@ -32,7 +32,7 @@ from splatbot.services.ros.publishers import FROM_ROS, ODOMETRY, POINTS, ROSOUT,
 from splatbot.services.ros.robot_topics import TYPES_OF_ROBOT
 from splatbot.services.ros.subscribers import FramePairs, RosSubscribers
 from splatbot.services.store import MapStore
-from splatbot.services.topics import FRAME, RESULT, JointState, RosFrame, arm_topic, map_topic, robot_topic
+from splatbot.services.topics import FRAME, RESULT, JointState, arm_topic, map_topic, robot_topic
 from splatbot.slam import FrameResult
 from tests.conftest import MakeLog
 from tests.models import random_model

@@ -1,4 +1,4 @@
-"""The transforms of /tf and /tf_static of the last 10 s, interpolated at the time of an image."""
+"""Transforms of TF, live or of a recording, interpolated at the time of an image."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import bisect
 import math
 import threading
 import time
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from array import array
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from splatbot.geometry import inverse, pose_from_quat
 from splatbot.logs.joints import MAX_GAP
+from splatbot.logs.ros_transforms import StampedTransform
 from splatbot.mapping.selfmask import JointsUnknownError
 from splatbot.protocols import Array
 
@@ -21,40 +23,7 @@ MAX_FRAMES = 512
 MAX_TRANSFORMS = 100_000  # of moving frames: ten links at 1 kHz over the kept time
 _KEPT_S = 10.0  # [s] of transforms
 _SET_BACK_S = 0.5  # [s] by which a transform may be older than the newest one of its frame
-_LONGEST_NAME = 256
-_FARTHEST = 1e6  # [m]
 _NO_TF = "publish their TF, or joint states, with T_link_camera in scene.yaml"
-
-
-@dataclass(frozen=True, eq=False)
-class StampedTransform:
-    """Pose of a frame in its parent at a time.
-
-    Args:
-        parent, child: names of the frames.
-        stamp: [s].
-        translation: (3,) [m].
-        quat: (4,) wxyz.
-        static: whether the pose holds at all times.
-    """
-
-    parent: str
-    child: str
-    stamp: float
-    translation: Collection[float]
-    quat: Collection[float]
-    static: bool = False
-
-    def is_usable(self) -> bool:
-        """Return whether the names are distinct and of a fair length, and the numbers finite and a pose."""
-        names, numbers = (self.parent, self.child), (self.stamp, *self.translation, *self.quat)
-        return (
-            self.parent != self.child
-            and all(0 < len(name) <= _LONGEST_NAME for name in names)
-            and all(map(math.isfinite, numbers))
-            and max(map(abs, self.translation)) <= _FARTHEST
-            and any(self.quat)
-        )
 
 
 @dataclass(eq=False)
@@ -63,32 +32,55 @@ class _Edge:
 
     parent: str
     static: bool
-    stamps: list[float] = field(default_factory=list)
-    poses: list[NDArray[np.float64]] = field(default_factory=list)
+    stamps: array[float] = field(default_factory=lambda: array("d"))
+    values: array[float] = field(default_factory=lambda: array("d"))
+
+    def pose(self, index: int) -> NDArray[np.float64]:
+        """Return the pose (7,) at an index, which may be -1 for the newest."""
+        begin = index % len(self.stamps) * 7
+        return np.array(self.values[begin : begin + 7])
+
+    def insert(self, stamp: float, pose: Iterable[float]) -> None:
+        """Insert a pose (7,) at its stamp [s]; it replaces one of the same stamp."""
+        at = bisect.bisect_left(self.stamps, stamp)
+        if at == len(self.stamps) or self.stamps[at] != stamp:
+            self.stamps.insert(at, stamp)
+            self.values[7 * at : 7 * at] = array("d", pose)
+        else:
+            self.values[7 * at : 7 * at + 7] = array("d", pose)
+
+    def keep(self, seconds: float, most: int) -> None:
+        """Keep the poses of the last seconds [s], and of these the newest ones."""
+        old = max(bisect.bisect_left(self.stamps, self.stamps[-1] - seconds), len(self.stamps) - most)
+        del self.stamps[:old], self.values[: 7 * old]
 
     def at(self, stamp: float) -> NDArray[np.float64] | None:
         """Interpolate the pose (7,) at a stamp [s]; None if a neighbour is more than 0.1 s away, or missing."""
         if self.static:
-            return self.poses[-1]
+            return self.pose(-1)
         after = bisect.bisect_left(self.stamps, stamp)
         if after < len(self.stamps) and self.stamps[after] == stamp:
-            return self.poses[after]
+            return self.pose(after)
         if not 0 < after < len(self.stamps):
             return None
         before, later = self.stamps[after - 1], self.stamps[after]
         if max(stamp - before, later - stamp) > MAX_GAP:
             return None
-        return _between(self.poses[after - 1], self.poses[after], (stamp - before) / (later - before))
+        return _between(self.pose(after - 1), self.pose(after), (stamp - before) / (later - before))
 
 
 class TransformBuffer:
-    """Transforms of clients; any thread adds to it, and mapping reads it.
+    """Transforms of clients, or of a recording; any thread adds to it, and mapping reads it.
 
-    It holds 512 frames at most, and 10 s or 100,000 transforms of those that move. If a clock is set back, the
-    transforms of moving frames are forgotten.
+    It holds 512 frames at most. If a clock is set back, the transforms of moving frames are forgotten.
+
+    Args:
+        kept_s: time [s] for which transforms of moving frames are kept.
+        most: number of transforms that are kept.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, kept_s: float = _KEPT_S, most: int = MAX_TRANSFORMS) -> None:
+        self._kept_s, self._most = kept_s, most
         self._edges: dict[str, _Edge] = {}
         self._changed = threading.Condition()
 
@@ -113,16 +105,8 @@ class TransformBuffer:
         if edge is None or one.static or edge.static or edge.parent != one.parent:
             edge = self._edges[one.child] = _Edge(one.parent, one.static)
         norm = math.hypot(*one.quat)
-        pose = np.array([*one.translation, *(part / norm for part in one.quat)])
-        at = bisect.bisect_left(edge.stamps, one.stamp)
-        if at < len(edge.stamps) and edge.stamps[at] == one.stamp:
-            edge.poses[at] = pose
-        else:
-            edge.stamps.insert(at, one.stamp)
-            edge.poses.insert(at, pose)
-        most = MAX_TRANSFORMS // len(self._edges)
-        old = max(bisect.bisect_left(edge.stamps, edge.stamps[-1] - _KEPT_S), len(edge.stamps) - most)
-        del edge.stamps[:old], edge.poses[:old]
+        edge.insert(one.stamp, (*one.translation, *(part / norm for part in one.quat)))
+        edge.keep(self._kept_s, self._most // len(self._edges))
 
     def poses(self, target: str, sources: Sequence[str], stamp: float, wait_s: float = 0.0) -> Array:
         """Interpolate T_target_source (N, 4, 4) [m] of N frames at a stamp [s]; wait up to ``wait_s`` [s] for them.
@@ -150,7 +134,7 @@ class TransformBuffer:
             if common is None:
                 return None
             up, down = self._down(target, common), self._down(source, common)
-            return _relative(up, down, {child: self._edges[child].poses[-1] for child in (*up, *down)})
+            return _relative(up, down, {child: self._edges[child].pose(-1) for child in (*up, *down)})
 
     def carrier(self, frame: str, links: Sequence[str]) -> str | None:
         """Return the first of the links on the way from a frame up to its root; None if no link carries the frame."""

@@ -10,8 +10,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
+from splatbot.logs.ros_transforms import StampedTransform
 from splatbot.mapping.selfmask import JointsUnknownError
-from splatbot.services.ros.tf_buffer import MAX_FRAMES, MAX_TRANSFORMS, StampedTransform, TransformBuffer
+from splatbot.robots.tf_buffer import MAX_FRAMES, MAX_TRANSFORMS, TransformBuffer
 
 Array = NDArray[np.float64]
 

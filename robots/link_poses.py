@@ -1,0 +1,72 @@
+"""Masks of a robot from the poses of its links in TF."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from splatbot.frame import Frame
+from splatbot.geometry import inverse
+from splatbot.logs.ros_frames import RosFrame
+from splatbot.mapping.selfmask import REACH, JointsUnknownError, SelfMask
+from splatbot.protocols import Array
+from splatbot.robots.link_frames import LinkFrames
+from splatbot.robots.robot import RobotModel
+from splatbot.robots.tf_buffer import TransformBuffer
+
+_TILT = 0.05  # [rad] by which the axis of a joint in TF may differ from the model
+
+
+class LinkPoses:
+    """Poses of a robot's links by TF at the times of images.
+
+    Args:
+        robot: the robot.
+        transforms: of TF.
+        prefix: of the names of its links.
+    """
+
+    def __init__(self, robot: RobotModel, transforms: TransformBuffer, prefix: str = "") -> None:
+        self._robot, self.transforms = robot, transforms
+        self.frames = None if robot.link_frames is None else robot.link_frames.prefixed(prefix)
+
+    def __bool__(self) -> bool:
+        """Return whether the links have names, and there are transforms."""
+        return self.frames is not None and len(self.transforms) > 0
+
+    def mask(self, mask: SelfMask, frame: Frame, stamp: float, wait_s: float = 0.0) -> Frame:
+        """Return the frame with the robot at a stamp [s] removed from its mask; wait up to ``wait_s`` [s] for TF.
+
+        The pose of the camera is that of the mask. If the mask has none, it is that of the image's frame in TF.
+
+        Raises:
+            JointsUnknownError: the poses of links or camera are not known at that time, or do not fit the model.
+        """
+        frames = self._named()
+        if mask.has_camera:
+            return mask.at_poses(frame, self._at(frames, frames.names[0], stamp, wait_s))
+        camera_frame = frame.camera_frame if isinstance(frame, RosFrame) else ""
+        if not camera_frame:
+            hint = "set header.frame_id of the images, or give T_link_camera (scene.yaml; robot of POST /v1/maps)"
+            raise JointsUnknownError("the images name no frame of their camera.", field="frame_id", hint=hint)
+        return mask.at_poses(frame, self._at(frames, camera_frame, stamp, wait_s), np.eye(4))
+
+    def _named(self) -> LinkFrames:
+        if self.frames is None:
+            hint = "add it again: splatbot robot add FILE.urdf --overwrite, or publish its joint states"
+            problem = f"TF cannot mask {self._robot.name}: its stored file does not name its links."
+            raise JointsUnknownError(problem, field="tf", hint=hint)
+        return self.frames
+
+    def _at(self, frames: LinkFrames, target: str, stamp: float, wait_s: float) -> Array:
+        """Return the poses T_target_link (J + 1, 4, 4) of the model's links [m], which fit the model."""
+        T = np.asarray(self.transforms.poses(target, frames.names, stamp, wait_s) @ frames.T_frame_link)
+        for k, joint in enumerate(self._robot.joints):
+            moved = inverse(T[k] @ joint.T_before_joint) @ T[k + 1]
+            away = float(np.linalg.norm(moved[: 2 if joint.prismatic else 3, 3]))
+            if away > REACH or moved[2, 2] < np.cos(_TILT):
+                tilt = float(np.arccos(np.clip(moved[2, 2], -1.0, 1.0)))
+                where = f"{frames.names[k + 1]} in TF is {100 * away:.1f} cm and {tilt:.2f} rad"
+                hint = "name the robot that publishes TF, or publish its joint states"
+                problem = f"{where} from the model of {self._robot.name}."
+                raise JointsUnknownError(problem, field="tf", hint=hint)
+        return T
