@@ -2,20 +2,34 @@
 
 from __future__ import annotations
 
+import math
+import sys
+from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from numpy.typing import ArrayLike
 
-from splatbot.errors import FormatError, InputError
+from splatbot.errors import FormatError, InputError, LogError
+from splatbot.frame import Frame
 from splatbot.layouts import log_kind
 from splatbot.logs import Log, open_log
 from splatbot.logs.rig import RigLog
-from splatbot.mapping.selfmask import SelfMask
+from splatbot.mapping.selfmask import JointsUnknownError, SelfMask
 from splatbot.protocols import RobotKinematics
 from splatbot.results.folder import RunFolder
+from splatbot.robots.link_poses import LinkPoses
+from splatbot.robots.robot import RobotModel
 from splatbot.robots.store import load_robot
+from splatbot.robots.tf_buffer import TransformBuffer
 from splatbot.run.masked import MaskedLog
 from splatbot.workspace import NAME, Workspace, find_workspace
+
+if TYPE_CHECKING:
+    from splatbot.logs.bag import BagLog
+
+MAX_RECORDED = 5_000_000
+"""Largest number of transforms of a recording: 320 MB, ten minutes of eight links at 1 kHz."""
 
 
 def self_mask(
@@ -61,7 +75,7 @@ def open_without_robot(uri: str, robot: str | None, *, camera: str | None = None
 
     Args:
         uri: log whose folder has the joints (``joints.txt`` or a recording of ROS topics) and ``scene.yaml`` with the
-            camera's pose on its link.
+            camera's pose on its link. In a recording of ROS topics, TF may replace both.
         robot: name as listed by ``splatbot robot list``, or None.
         camera: intrinsics that replace those of the log.
 
@@ -73,10 +87,62 @@ def open_without_robot(uri: str, robot: str | None, *, camera: str | None = None
         return open_log(uri, camera=camera)
     if log_kind(uri) == "rig":  # each camera has a mount of its own
         return RigLog(uri, lambda address, own: open_without_robot(address, robot, camera=own))
-    workspace = find_workspace(uri)
-    mask = self_mask(load_robot(robot), workspace, file=f"{uri}/{NAME}")
-    assert workspace is not None
-    return MaskedLog(open_log(uri, camera=camera, joint_delay=workspace.joint_delay), mask)
+    model, workspace, file = load_robot(robot), find_workspace(uri) or Workspace(), f"{uri}/{NAME}"
+    log = open_log(uri, camera=camera, joint_delay=workspace.joint_delay)
+    if log_kind(uri) == "bag":
+        from splatbot.logs.bag import BagLog  # rosbags builds its message classes when imported
+
+        if isinstance(log, BagLog) and log.has_transforms:
+            return MaskedLog(log, RecordedMask(model, workspace, log))
+    return MaskedLog(log, self_mask(model, workspace, file=file))
+
+
+class RecordedMask:
+    """Masks the robot in the frames of a recording of ROS topics.
+
+    Its joint states at the time of a frame count first. Where they are missing, or the pose of the camera on its link
+    is not known, the poses of the links are those of TF at the times of colour and depth.
+
+    Args:
+        robot: the robot.
+        workspace: pose of the camera on its link, if known, names of joints and prefix in TF.
+        log: the recording.
+
+    Raises:
+        InputError: the workspace does not fit the robot.
+    """
+
+    def __init__(self, robot: RobotModel, workspace: Workspace, log: BagLog) -> None:
+        self._robot, self._workspace, self._log = robot, workspace, log
+        self._mask = self_mask(robot, workspace, needs_camera=False)
+
+    def __call__(self, frame: Frame) -> Frame:
+        """Return the frame with the robot removed from its mask.
+
+        Raises:
+            JointsUnknownError: neither joint states nor TF give the poses of the links at its time.
+            LogError: the recording has too many transforms.
+        """
+        if self._mask.has_camera:
+            try:
+                return self._mask(frame)
+            except JointsUnknownError:
+                if not self._link_poses:
+                    raise
+        masked = frame
+        for after in {0.0, frame.depth_delay}:
+            masked = self._link_poses.mask(self._mask, masked, frame.stamp + after + self._workspace.joint_delay)
+        return masked
+
+    @cached_property
+    def _link_poses(self) -> LinkPoses:
+        transforms = TransformBuffer(kept_s=math.inf, most=sys.maxsize)
+        for count, one in enumerate(self._log.transforms()):
+            if count >= MAX_RECORDED:
+                hint = "split the recording, or record /joint_states and write T_link_camera to scene.yaml"
+                raise LogError(f"has more than {MAX_RECORDED} transforms.", file=self._log.path, field="/tf", hint=hint)
+            transforms.add([one])
+        return LinkPoses(self._robot, transforms, self._workspace.tf_prefix)
 
 
 def reopen_log(run: RunFolder, *, uri: str | None = None, camera: str | None = None) -> Log:

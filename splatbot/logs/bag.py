@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -29,6 +29,7 @@ from splatbot.logs.presets import find_calibration
 from splatbot.logs.ros_frames import (
     COLOR_ENCODINGS,
     DEPTH_ENCODINGS,
+    RosFrame,
     camera_of,
     color_of,
     depth_of,
@@ -37,6 +38,7 @@ from splatbot.logs.ros_frames import (
     seconds_of,
     to_nanoseconds,
 )
+from splatbot.logs.ros_transforms import TF, TF_STATIC, StampedTransform, transforms_of
 from splatbot.logs.ros_types import Message, typestore
 from splatbot.logs.streams import bag_streams, header_stamp, obstacle_to_mapping
 from splatbot.logs.undistort import Undistorter
@@ -63,8 +65,8 @@ class BagLog(StampedLog):
 
     Colour images without depth within 0.02 s, or the option `pair_within`, are skipped and counted in ``unpaired``. If
     recorded, joint positions are read from /joint_states, masks (white pixels are valid) from /camera/mask/image_raw
-    and reference poses from /ground_truth/pose. Frames are decoded on access; the file stays open. The class is not
-    thread-safe.
+    and reference poses from /ground_truth/pose. Frames are :class:`splatbot.logs.ros_frames.RosFrame`; they are decoded
+    on access, and the file stays open. The class is not thread-safe.
 
     Args:
         path: the file or folder.
@@ -122,9 +124,21 @@ class BagLog(StampedLog):
         poses = self._checked(TRUTH, lambda: np.stack([pose_of(m.pose) for m in messages]))
         return Trajectory(np.array([seconds_of(m.header.stamp) for m in messages]), poses)
 
+    @property
+    def has_transforms(self) -> bool:
+        """Return whether the recording has messages of TF."""
+        return any(c.topic in (TF, TF_STATIC) and c.msgcount for c in self._reader.connections)
+
+    def transforms(self) -> Iterator[StampedTransform]:
+        """Yield the transforms of /tf_static, then those of /tf, in the order of their receive times."""
+        for topic in (TF_STATIC, TF):
+            for message in self._all(topic):
+                yield from transforms_of(message, static=topic == TF_STATIC)
+
     def _decode(self, index: int) -> Frame:
         color, depth = self._pairs[index]
-        rgb = self._checked(self._color, lambda: color_of(self._read(self._color, color)))
+        message = self._checked(self._color, lambda: self._read(self._color, color))
+        rgb = self._checked(self._color, lambda: color_of(message))
         z = self._checked(self._depth, lambda: depth_of(self._read(self._depth, depth)))
         mask = self._mask(color.stamp)
         where = f"{self.path} {self._color} {index}"
@@ -136,7 +150,7 @@ class BagLog(StampedLog):
             mask = None if mask is None else self._undistort.mask(mask)
         names, joints = self._joints.at(color.stamp + self._joint_delay) or ((), None)
         try:
-            return Frame(
+            return RosFrame(
                 color.stamp,
                 rgb,
                 z,
@@ -147,6 +161,7 @@ class BagLog(StampedLog):
                 source=where,
                 depth_delay=depth.stamp - color.stamp,
                 joint_names=names,
+                camera_frame=message.header.frame_id.strip("/"),
             )
         except InputError as error:
             raise LogError(error.message, file=where, field=error.field, hint=error.hint) from error
