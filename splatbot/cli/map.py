@@ -261,6 +261,7 @@ def _mishaps(metrics: dict[str, Any]) -> list[tuple[str, str]]:
 
 def _print_summary(result: RunResult) -> None:
     from splatbot.cli.tables import print_table
+    from splatbot.results.cameras import camera_rows
     from splatbot.results.units import count, decibels, megabytes, metres, milliseconds
 
     m = result.metrics
@@ -272,6 +273,7 @@ def _print_summary(result: RunResult) -> None:
         ("ATE RMSE", metres(m["ate_rmse_m"]) + (" from the log's reference poses" if m["ate_frames"] else "")),
         ("PSNR, held-out views", decibels(m["psnr_holdout_db"])),
         ("depth error, median", metres(m["depth_median_m"])),
+        *((f"camera {name}", text) for name, text in camera_rows(m["cameras"])),
         ("Gaussians", f"{count(m['gaussians'])}, {megabytes(m['map_bytes'])}"),
         ("time per frame", f"median {milliseconds(ms['p50'])}, 95 % {milliseconds(ms['p95'])}"),
         *(("question", doubt) for doubt in run_doubts(m)),

@@ -15,6 +15,7 @@ from splatbot.report.figures import error_plot, gaussians_plot, stages_plot, tra
 from splatbot.report.images import CaptionedView, comparison
 from splatbot.report.parts import details, document, image, note, pictures, section, table, tiles
 from splatbot.results.audit import RunAudit
+from splatbot.results.cameras import camera_rows
 from splatbot.results.folder import FrameRow
 from splatbot.results.scoring import ShownView, TrajectoryScore, ViewScores
 from splatbot.results.units import count, decibels, megabytes, metres, milliseconds, percent
@@ -53,6 +54,7 @@ def report_html(
         section("Trajectory", image(trajectory_plot(trajectory, track), "trajectory"), _no_reference(track)),
         section("Error over time", image(error_plot(rows, track), "position error over time")),
         section("Degraded and lost frames", _verdicts(rows)),
+        *_cameras(metrics["cameras"]),
         section("Held-out views", *(_view(view) for view in views.shown), _views_note(metrics, views)),
         audit_section(audit),
         section("Time per frame", image(stages_plot(rows), "milliseconds per stage"), _stages(metrics), _pace(metrics)),
@@ -110,6 +112,10 @@ def _map_frame(page: str | None) -> str:
 def _verdicts(rows: Sequence[FrameRow]) -> str:
     counts = Counter((row.verdict, reason) for row in rows if row.verdict != "ok" for reason in row.reasons or ("",))
     return table(("verdict and reason", "frames"), [(f"{v}: {r}", str(n)) for (v, r), n in counts.most_common(12)])
+
+
+def _cameras(cameras: Mapping[str, Any]) -> list[str]:
+    return [section("Further cameras", table(("camera", "frames and pose"), camera_rows(cameras)))] if cameras else []
 
 
 def _view(view: ShownView) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 from splatbot.geometry import rotation_to_quat
 from splatbot.mapping.further_camera import FurtherCamera, MountedCamera
 from splatbot.results.folder import FrameRow
+from splatbot.results.units import degrees, metres
 
 
 def camera_metrics(rows: Sequence[FrameRow], cameras: Mapping[str, FurtherCamera]) -> dict[str, dict[str, Any]]:
@@ -38,3 +39,19 @@ def _metrics(rows: Sequence[FrameRow], camera: FurtherCamera) -> dict[str, Any]:
         "rotation_sigma": float(sigma[3:].max()),
     }
     return {"kind": "carried" if camera.carried else "fixed", **counts, "pose": pose if camera.pose.known else None}
+
+
+def camera_rows(cameras: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, str]]:
+    """Return the name and a summary of each further camera of :func:`camera_metrics`.
+
+    The summary has its frames, and the standard deviation of an estimated pose or the reason why that is unknown.
+    """
+    rows = []
+    for name, camera in cameras.items():
+        text, pose = f"{camera['kind']}, {camera['tracked']} of {camera['frames']} frames", camera["pose"]
+        if pose is not None and pose["translation_sigma"] > 0:
+            text += f", pose ± {metres(pose['translation_sigma'])}, {degrees(pose['rotation_sigma'])}"
+        elif camera["tracked"] == 0 and camera["reason"]:
+            text += f": {camera['reason']}"
+        rows.append((name, text))
+    return rows

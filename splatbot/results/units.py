@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 NONE = "-"
 
 
@@ -12,6 +14,11 @@ def metres(value: float | None) -> str:
     if abs(value) < 0.02:
         return f"{1e3 * value:.2f} mm"
     return f"{1e2 * value:.2f} cm" if abs(value) < 1.0 else f"{value:.2f} m"
+
+
+def degrees(value: float | None) -> str:
+    """Format an angle [rad] in degrees."""
+    return NONE if value is None else f"{math.degrees(value):.2f}°"
 
 
 def milliseconds(value: float | None) -> str:
