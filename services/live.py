@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from typing import Protocol
 
 from splatbot.errors import MapNotFoundError, SplatbotError
 from splatbot.frame import Frame
 from splatbot.gaussians import Snapshot
+from splatbot.mapping.further_camera import FurtherCamera
 from splatbot.protocols import FrameSource
 from splatbot.services.store import MapStore, ServedMap, State
 from splatbot.services.threads import join_started
-from splatbot.services.topics import FRAME, RESULT
+from splatbot.services.topics import FRAME, RESULT, of_camera
 from splatbot.slam import FrameResult
 from splatbot.trajectory import Trajectory
 
@@ -42,7 +43,12 @@ class LiveMapper(Protocol):
 
     @property
     def trajectory(self) -> Trajectory:
-        """Return the poses so far."""
+        """Return the poses of the first camera so far."""
+        ...
+
+    @property
+    def further_cameras(self) -> Mapping[str, FurtherCamera]:
+        """Return the cameras other than the first one, by name."""
         ...
 
     def close(self) -> None:
@@ -52,6 +58,8 @@ class LiveMapper(Protocol):
 
 class LiveMapping:
     """Feeds frames to a mapper, publishes each result on the bus, and a snapshot at every keyframe.
+
+    Frames and results of further cameras have topics of their own, and ``served.cameras`` describes these cameras.
 
     The map stays in the store when the frames end or fail: its state becomes "ended", or "failed" with the reason.
     :meth:`start` does so in a thread of its own, :meth:`run` in the caller's.
@@ -85,6 +93,7 @@ class LiveMapping:
         self._on_result = on_result
         self._on_error = on_error
         self._on_end = on_end
+        served.cameras.update(mapper.further_cameras)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self.run, name=f"mapping-{served.id}", daemon=True)
 
@@ -127,11 +136,12 @@ class LiveMapping:
         for frame in self._source:
             if self._stop.is_set():
                 break
-            self._store.tell(self._served, FRAME, frame)
+            self._store.tell(self._served, of_camera(frame.camera_name, FRAME), frame)
             result = self._process(frame)
             if result is None:
                 continue
-            self._store.tell(self._served, RESULT, result)
+            self._served.cameras.update(self._mapper.further_cameras, result)
+            self._store.tell(self._served, of_camera(result.camera_name, RESULT), result)
             if result.keyframe:
                 self._publish()
                 shown = result.index

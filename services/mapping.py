@@ -10,6 +10,7 @@ from typing import Any
 from splatbot.config import Config
 from splatbot.errors import InputError, LogError, MapNotFoundError
 from splatbot.logs import Log, open_log
+from splatbot.logs.rig import RigLog
 from splatbot.services.jobs import JobCancelled, JobHandle, Work
 from splatbot.services.live import LiveMapping
 from splatbot.services.problems import disk_error
@@ -95,6 +96,27 @@ def workspace_of(uri: str, robot_base: Any) -> Workspace | None:
     if robot_base is not None:
         return Workspace(T_world_base=robot_base)
     return None if uri.startswith("synthetic:") else find_workspace(uri)
+
+
+def open_rig(uri: str) -> tuple[Log, dict[str, Workspace]]:
+    """Open the recordings of several cameras, each with the joints of its own ``scene.yaml``.
+
+    Returns:
+        The log, and the workspaces of its cameras by name: of further ones those with a mount on the robot.
+
+    Raises:
+        LogError: the log is damaged.
+        FormatError: a ``scene.yaml`` is damaged.
+    """
+    found: list[Workspace] = []
+
+    def open_one(address: str, camera: str | None) -> Log:
+        found.append(find_workspace(address) or Workspace())
+        return open_log(address, camera=camera, joint_delay=found[-1].joint_delay)
+
+    log = RigLog(uri, open_one)
+    by_name = zip(("", *log.cameras), found, strict=True)
+    return log, {name: one for name, one in by_name if not name or one.T_link_camera is not None}
 
 
 def _map(

@@ -6,7 +6,7 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from typing import Any
@@ -16,6 +16,7 @@ from splatbot.errors import ConfigError, InputError, MapNotFoundError, SplatbotE
 from splatbot.frame import Frame
 from splatbot.protocols import FrameSource
 from splatbot.rasterize.native import native
+from splatbot.robots.robot import RobotModel
 from splatbot.services.arms import Arms, known_robot
 from splatbot.services.jobs import Job, Jobs, Work
 from splatbot.services.library import MapLibrary
@@ -33,6 +34,8 @@ from splatbot.services.threads import join_started
 from splatbot.services.topics import JOINTS, ROS_ROBOT, JointState, robot_topic
 from splatbot.workspace import Workspace
 
+ROS_MAP = "ros"
+"""Map of the frames of ROS topics."""
 _WAITING_NEWS = 2000  # messages of TF: 2 s of a robot at 1 kHz
 
 _log = logging.getLogger(__name__)
@@ -130,26 +133,33 @@ class Runtime:
             self.store.set_state(served.id, "mapping", problem, generation=served.generation)
 
     def open_stream(
-        self, map_id: str, *, workspace: Workspace | None = None, mask: RobotMask | None = None
+        self,
+        map_id: str,
+        *,
+        workspace: Workspace | None = None,
+        mask: RobotMask | None = None,
+        config: Config | None = None,
     ) -> ServedMap:
         """Create a map that receives its frames through :meth:`stream`; ``mask`` masks the robot in them.
+
+        Args:
+            config: of its mapping, with its further cameras. If None, that of the service.
 
         Raises:
             MapExistsError: the name is taken.
         """
         from splatbot.slam import Slam
 
+        config = config or self.config
         served = self.store.add(
             map_id, source="pushed frames", state="mapping", workspace=workspace, mask=mask, awaited=False
         )
-        if mask is not None:
-            mask.topics = self._robot_topics
-        frames = PushedFrames(self.settings.max_waiting_frames, mask)
+        frames = PushedFrames(self.settings.max_waiting_frames, mask, config.cameras)
         mapping = LiveMapping(
             self.store,
             served,
             frames,
-            Slam(self.config),
+            Slam(config),
             on_result=frames.answer,
             on_error=frames.refuse,
             on_end=lambda: self._stream_ended(served.generation, frames),
@@ -174,7 +184,7 @@ class Runtime:
             raise StreamEndedError(f"map {map_id!r} is not made of pushed frames.", hint=hint)
         return frames
 
-    def take(self, frame: Frame, map_id: str = "ros") -> None:
+    def take(self, frame: Frame, map_id: str = ROS_MAP) -> None:
         """Map a frame that was published, not pushed into a map: the first one makes the map.
 
         Raises:
@@ -189,19 +199,41 @@ class Runtime:
             raise InputError(f"map {map_id!r} masks no robot.", field="map", hint=hint)
         self.stream(map_id).push(frame)
 
-    def new_mask(self, workspace: Workspace | None) -> RobotMask | None:
+    def new_mask(self, workspace: Workspace | None, further: Mapping[str, Workspace] | None = None) -> RobotMask | None:
         """Return a mask of the settings' robot for the camera of a workspace; None without such a robot.
 
+        Args:
+            workspace: of the first camera.
+            further: of further cameras by name.
+
         Raises:
-            InputError: the pose of the camera is unknown, or the workspace does not fit the robot.
+            InputError: the pose of a camera is unknown, or a workspace does not fit the robot.
         """
-        return None if self.robot is None else RobotMask(self.robot, workspace, self._robot_topics)
+        return None if self.robot is None else RobotMask(self.robot, workspace, self._robot_topics, further=further)
+
+    def mask_of_stream(
+        self,
+        map_id: str,
+        robot: RobotModel,
+        workspace: Workspace | None,
+        further: Mapping[str, Workspace] | None = None,
+    ) -> RobotMask:
+        """Return a mask of a robot for the map of a stream; for frames of ROS topics, TF may have the camera's pose.
+
+        Args:
+            map_id: name of the map.
+            robot: the robot.
+            workspace: pose of the camera on its link, and names, offsets and delay of the joints.
+            further: workspaces of further cameras by name.
+
+        Raises:
+            InputError: the pose of a camera is unknown, or a workspace does not fit the robot.
+        """
+        topics, in_tf = self._robot_topics, map_id == ROS_MAP
+        return RobotMask(robot, workspace, topics, camera_in_tf=in_tf, further=further)
 
     def _new_mask_of_topics(self) -> RobotMask | None:
-        """Return a mask for a camera of ROS topics, whose pose may be in TF."""
-        if self.robot is None:
-            return None
-        return RobotMask(self.robot, self.workspace, self._robot_topics, camera_in_tf=True)
+        return None if self.robot is None else self.mask_of_stream(ROS_MAP, self.robot, self.workspace)
 
     def report_joints(self, robot: str, state: JointState) -> int:
         """Publish a robot's joints, and keep them for the frames of each map in which it is masked.

@@ -7,7 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, model_validator
 
 from splatbot.errors import InputError
 from splatbot.geometry import pose_from_quat
@@ -88,6 +88,9 @@ class MapInfo(BaseModel):
     stamp: float = Field(description="time of the last frame in the map [s]")
     bounds: Bounds | None = Field(None, description="null while the map is empty")
     robot: RobotMaskInfo | None = Field(None, description="robot that is masked in the frames; null: none")
+    cameras: dict[str, FurtherCameraInfo] = Field(
+        {}, description="further cameras by name, while the process maps; their frames are in no other field"
+    )
 
 
 class MapList(BaseModel):
@@ -101,7 +104,9 @@ class RobotInView(Request):
 
     name: str = Field(description="robot, as `splatbot robot list` names it")
     T_link_camera: Pose | None = Field(
-        None, description="pose of the camera on its link; values left out are those of the recording's scene.yaml"
+        None,
+        description="pose of the camera on its link; values left out are those of the recording's scene.yaml. In the "
+        "map `ros`, of frames of ROS topics, it may be left out if TF has it",
     )
     camera_link: int = Field(-1, description="index of the link that carries the camera; -1: the last, 0: the base")
     joint_offsets: list[float] | None = Field(
@@ -120,7 +125,7 @@ class RobotInView(Request):
         "", max_length=MAX_PREFIX, description="prefix of the names of the robot's links in TF, as left_"
     )
 
-    def workspace(self, known: Workspace | None) -> Workspace | None:
+    def workspace(self, known: Workspace | None) -> Workspace:
         """Return the workspace with the given values; the others are those of the known one.
 
         Raises:
@@ -144,6 +149,77 @@ class RobotMaskInfo(BaseModel):
     problem: str | None = Field(None, description="why the latest frame was refused; null if it was masked")
 
 
+class CameraOnRobot(Request):
+    """Mount of a further camera on the map's robot, whose pixels are masked in its frames."""
+
+    T_link_camera: Pose = Field(description="pose of the camera on its link")
+    camera_link: int = Field(-1, description="index of the link that carries it; -1: the last, 0: the base")
+
+    def workspace(self, first: Workspace) -> Workspace:
+        """Return the workspace of the camera; the joints are those of the workspace of the first camera.
+
+        Raises:
+            InputError: a value is invalid.
+        """
+        return replace(first, T_link_camera=self.T_link_camera.matrix("T_link_camera"), camera_link=self.camera_link)
+
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class FurtherCameraIn(Request):
+    """A camera of the map other than the first one: fixed, carried, or with neither pose free.
+
+    The pose is exact if both standard deviations are 0. Otherwise it is the start of an estimate against the map.
+    """
+
+    T_world_camera: Pose | None = Field(
+        None, description="pose of a fixed camera; the world is the first camera in its first frame"
+    )
+    T_first_camera: Pose | None = Field(None, description="pose on the first camera, which carries it")
+    translation_sigma: float = Field(
+        0.0, description="standard deviation of the translation along each axis, at most 0.2 [m]"
+    )
+    rotation_sigma: float = Field(
+        0.0, description="standard deviation of the rotation about each axis, at most 0.35 [rad]"
+    )
+    sensor: dict[str, Finite | list[Finite]] = Field(
+        {}, max_length=64, description="values of the section `sensor` of the configuration"
+    )
+    robot: CameraOnRobot | None = Field(
+        None, description="its mount on the map's robot; without it, frames are refused in a map with a robot"
+    )
+
+    def settings(self) -> dict[str, Any]:
+        """Return the values of :class:`splatbot.config.CameraConfig`."""
+        return self.model_dump(exclude={"robot"}, exclude_none=True)
+
+
+MAX_FURTHER_CAMERAS = 7
+CameraName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_-]{1,32}$")]
+
+
+class MountPose(BaseModel):
+    """Estimated or given pose of a fixed camera (T_world_camera), or of a carried one (T_first_camera)."""
+
+    translation: Vector3 = Field(description="[m]")
+    quaternion_wxyz: Vector4 = Field(description="rotation")
+    translation_sigma: float = Field(description="largest standard deviation along an axis; 0: given as exact [m]")
+    rotation_sigma: float = Field(description="largest standard deviation about an axis; 0: given as exact [rad]")
+
+
+class FurtherCameraInfo(BaseModel):
+    """A further camera of a map as it is now."""
+
+    kind: Literal["fixed", "carried", "free"] = Field(description="its relation to world and first camera")
+    frames: int = Field(description="frames that were read; refused ones do not count")
+    tracked: int = Field(description="frames with a pose")
+    lost: int = Field(description="frames without a pose, which are not mapped")
+    keyframes: int = Field(description="frames that entered the map")
+    reason: str | None = Field(description="why the newest frame has no pose; null if it has one")
+    pose: MountPose | None = Field(description="null while it is not known, and for a free camera")
+
+
 class MapRequest(Request):
     """A map to be made: of a recording, or, without ``log``, of frames that will be pushed."""
 
@@ -153,6 +229,11 @@ class MapRequest(Request):
     max_frames: Annotated[int, Field(ge=1)] | None = Field(None, description="read no more than these")
     robot_base: Pose | None = Field(None, description="T_world_base, for questions about the arm")
     robot: RobotInView | None = Field(None, description="robot in view, which is masked; null: no robot is masked")
+    cameras: dict[CameraName, FurtherCameraIn] | None = Field(
+        None,
+        max_length=MAX_FURTHER_CAMERAS,
+        description="further cameras of pushed frames by name; null: those of the service's configuration",
+    )
 
 
 class DistanceRequest(Request):

@@ -13,6 +13,7 @@ from splatbot.errors import InputError, MapNotFoundError
 from splatbot.gaussians import Snapshot
 from splatbot.results.folder import RunFolder
 from splatbot.services.bus import Bus
+from splatbot.services.camera_states import CameraStates
 from splatbot.services.derived import Derived
 from splatbot.services.frames_first import FramesFirst
 from splatbot.services.problems import MapNotReadyError
@@ -55,6 +56,7 @@ class ServedMap:
         mask: of the robot in its frames, while it is mapped; None if no robot is masked.
         generation: number of the map in this process; a later map of the same name has another.
         derived: results computed from the snapshot.
+        cameras: further cameras, while it is mapped.
     """
 
     id: str
@@ -69,6 +71,7 @@ class ServedMap:
     mask: RobotMask | None = dataclasses.field(default=None, repr=False, compare=False)
     generation: int = 0
     derived: Derived = dataclasses.field(default_factory=Derived, repr=False, compare=False)
+    cameras: CameraStates = dataclasses.field(default_factory=CameraStates, repr=False, compare=False)
 
     @property
     def map_version(self) -> int:

@@ -6,6 +6,7 @@
 | ``maps/{id}/removed`` | :class:`splatbot.services.store.ServedMap`: the map as it was when it was deleted |
 | ``maps/{id}/frame`` | :class:`splatbot.frame.Frame`: the frame that the mapper received |
 | ``maps/{id}/result`` | :class:`splatbot.slam.FrameResult`: odometry, verdict, keyframe, stage timings |
+| ``maps/{id}/cameras/{name}/frame`` and ``result`` | the same of a further camera; those above are of the first one |
 | ``maps/{id}/trajectory`` | :class:`splatbot.trajectory.Trajectory`: all poses so far, at each published state |
 | ``maps/{id}/plan`` | :class:`splatbot.planning.RobotTrajectory`: the latest planned motion |
 | ``maps/{id}/grasps`` | :class:`splatbot.grasping.types.GraspResult`: the grasps that were found last |
@@ -18,12 +19,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-
-from splatbot.frame import Frame
 
 STATE = "state"
 REMOVED = "removed"
@@ -53,20 +52,14 @@ class JointState:
     velocity: NDArray[np.float64] | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class RosFrame(Frame):
-    """A frame of a ROS camera.
-
-    Args:
-        camera_frame: name of the optical frame of the camera in TF.
-    """
-
-    camera_frame: str = field(default="", kw_only=True)
-
-
 def map_topic(map_id: str, kind: str) -> str:
     """Return the topic of a map, e.g. ``map_topic("default", RESULT)``; "*" as id makes a pattern for every map."""
     return f"maps/{map_id}/{kind}"
+
+
+def of_camera(camera_name: str, kind: str) -> str:
+    """Return the kind of topic of a camera, e.g. ``of_camera("table", RESULT)``; the first one has an empty name."""
+    return f"cameras/{camera_name}/{kind}" if camera_name else kind
 
 
 def robot_topic(robot: str, kind: str) -> str:

@@ -103,6 +103,7 @@ class TrackedFrame:
         gaussians: size of the map afterwards.
         map_version: latest version of the map.
         stage_ms: time of each stage of tracking and mapping [ms].
+        reasons: causes of a verdict other than "ok".
     """
 
     T_world_camera: NDArray[np.float64] | None
@@ -111,6 +112,7 @@ class TrackedFrame:
     gaussians: int
     map_version: int
     stage_ms: dict[str, float]
+    reasons: list[str]
 
 
 _Result = TypeVar("_Result", Distances, Collisions, TrackedFrame)
@@ -171,7 +173,7 @@ class Client(AbstractContextManager["Client"]):
             map_id: name of the map.
             log: synthetic:SCENE?..., or a folder under the service's log roots.
             key: Idempotency-Key; a repeated request with the same key returns the same job.
-            more: camera, max_frames, robot_base, robot.
+            more: camera, max_frames, robot_base, robot, cameras.
         """
         body = {"id": map_id, **({"log": log} if log is not None else {}), **more}
         return self._json("POST", "/v1/maps", body, _idempotency(key))
@@ -181,7 +183,7 @@ class Client(AbstractContextManager["Client"]):
         self.request("DELETE", _map_path(map_id))
 
     def push(self, map_id: str, frame: Frame) -> TrackedFrame:
-        """Send a frame for tracking and mapping; wait while too many frames are in progress."""
+        """Send a frame of any camera for tracking and mapping; wait while too many frames are in progress."""
         c = frame.camera
         body = {
             "stamp": frame.stamp,
@@ -192,6 +194,7 @@ class Client(AbstractContextManager["Client"]):
             "depth_delay": frame.depth_delay,
             "joints": None if frame.joints is None else frame.joints.tolist(),
             "joint_names": list(frame.joint_names),
+            "camera_name": frame.camera_name,
         }
         answer = self._packed("POST", _map_path(map_id, "frames"), body)
         return _result(TrackedFrame, answer)

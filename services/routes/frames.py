@@ -35,7 +35,10 @@ class FrameRequest(Body):
     Arrays are rgb (H, W, 3) uint8 and depth (H, W) float32 [m] or uint16.
     """
 
-    stamp: float = Field(allow_inf_nan=False, description="[s]; later than the frame before, by at most a day")
+    stamp: float = Field(
+        allow_inf_nan=False, description="[s]; later than the camera's frame before, within a day of the map's newest"
+    )
+    camera_name: str = Field("", max_length=32, description="further camera of the map; empty: the first one")
     camera: CameraIn = Field(description="pinhole intrinsics of both images")
     rgb: Any = Field(description="PNG or JPEG, or array")
     depth: Any = Field(description="16-bit PNG, or array; 0 where it is not known")
@@ -98,11 +101,19 @@ _Body = Annotated[FrameRequest, Depends(body_of(FrameRequest))]
     "/{map_id}/frames",
     response_class=Response,
     responses=answers(_ANSWER) | problems(404, 409, 413, 415, 422, 503),
-    openapi_extra=request_body(FrameRequest, {"a small frame": _example()}),
+    openapi_extra=request_body(
+        FrameRequest,
+        {"a small frame": _example(), "of a further camera": _example() | {"camera_name": "table", "stamp": 0.04}},
+    ),
 )
 def push_frame(request: Request, served: Served, service: Service, query: _Body) -> Response:
-    """Track a frame and map it; the answer says where the camera was. 503: as many frames wait as may."""
+    """Track a frame and map it; the answer says where the camera was. 503: as many frames wait as may.
+
+    Frames of different cameras may come in any order; of those that wait, the earliest is mapped first. 409: a frame of
+    a carried camera is more than 2 ms before, or 0.1 s after, the newest frame of the first camera.
+    """
     frames = service.stream(served.id)
+    frames.check_camera(query.camera_name)  # before its images are decoded
     pushed = frames.push(_frame(query, service.settings.max_pixels))
     try:
         result = pushed.result(_WAIT_S)
@@ -164,6 +175,7 @@ def _frame(query: FrameRequest, max_pixels: int) -> Frame:
         mask=mask,
         depth_delay=query.depth_delay,
         source="the pushed frame",
+        camera_name=query.camera_name,
     )
 
 

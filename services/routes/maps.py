@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+from collections.abc import Mapping
 from contextlib import suppress
 from functools import partial
 from pathlib import Path as FilePath
@@ -15,6 +16,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 from starlette.responses import FileResponse
 
+from splatbot.config import Config, with_cameras
 from splatbot.errors import InputError, MapNotFoundError
 from splatbot.formats import WRITTEN, save_gaussians
 from splatbot.logs import open_log
@@ -38,7 +40,7 @@ from splatbot.services.problems import MapNotReadyError, TooLargeError
 from splatbot.services.recordings import allowed_log
 from splatbot.services.robot_mask import RobotMask
 from splatbot.services.routes.jobs import accepted, starts
-from splatbot.services.schemas import Bounds, MapInfo, MapList, MapRequest, RobotInView, RobotMaskInfo
+from splatbot.services.schemas import Bounds, FurtherCameraInfo, MapInfo, MapList, MapRequest, RobotMaskInfo
 from splatbot.services.scratch import Scratch
 from splatbot.services.store import ServedMap
 from splatbot.workspace import find_workspace
@@ -57,6 +59,22 @@ _EXAMPLE: dict[str, Any] = {
     "stamp": 1.3,
     "bounds": {"low": [-0.8, -0.5, 0.4], "high": [0.9, 0.4, 1.9]},
     "robot": {"name": "panda", "masked": 118, "refused": 2, "problem": None},
+    "cameras": {
+        "table": {
+            "kind": "fixed",
+            "frames": 40,
+            "tracked": 33,
+            "lost": 7,
+            "keyframes": 1,
+            "reason": None,
+            "pose": {
+                "translation": [0.61, -0.12, 0.4],
+                "quaternion_wxyz": [0.9, 0.05, -0.42, 0.1],
+                "translation_sigma": 0.0012,
+                "rotation_sigma": 0.0016,
+            },
+        }
+    },
 }
 _CREATE = {
     "a synthetic log": {"id": "tabletop", "log": "synthetic:tabletop?frames=8&width=160&height=120"},
@@ -70,6 +88,16 @@ _CREATE = {
             "name": "panda",
             "T_link_camera": {"translation": [0.05, 0.0, 0.05], "quaternion_wxyz": [1.0, 0.0, 0.0, 0.0]},
             "joint_delay": 0.02,
+        },
+    },
+    "frames of a moving and of a fixed camera": {
+        "id": "cell",
+        "cameras": {
+            "table": {
+                "T_world_camera": {"translation": [0.6, -0.1, 0.4], "quaternion_wxyz": [0.9, 0.05, -0.42, 0.1]},
+                "translation_sigma": 0.02,
+                "rotation_sigma": 0.035,
+            }
         },
     },
 }
@@ -98,10 +126,12 @@ def create_map(
     check_id(query.id)
     base = query.robot_base.matrix("robot_base") if query.robot_base is not None else None
     if query.log is None:
-        mask = _mask(query.robot, None)
-        served = service.open_stream(query.id, workspace=workspace_of("synthetic:", base), mask=mask)
+        mask, config = _mask(service, query, None), _with_cameras(service.config, query)
+        served = service.open_stream(query.id, workspace=workspace_of("synthetic:", base), mask=mask, config=config)
         place = {"Location": f"/v1/maps/{query.id}"}
         return Response(_info(served).model_dump_json(), 201, place, media_type="application/json")
+    if query.cameras:
+        raise InputError("are of pushed frames.", field="cameras", hint="leave out log, or cameras")
     request = query.model_dump_json()
     known = service.jobs.known(key, request)
     if known is not None:
@@ -110,7 +140,7 @@ def create_map(
     uri = allowed_log(
         query.log, limits.log_roots, camera=query.camera, max_frames=limits.max_frames, max_pixels=limits.max_pixels
     )
-    mask = _mask(query.robot, uri)
+    mask = _mask(service, query, uri)
     log = open_log(uri, camera=query.camera, joint_delay=0.0 if mask is None else mask.joint_delay)
     total = check_length(log, limits.max_frames, query.max_frames)
     workspace = workspace_of(uri, base)
@@ -170,7 +200,7 @@ async def upload_map(
 def get_map(served: Served, request: Request, response: Response) -> Any:
     """Describe a map; `state` and `detail` report the progress of mapping."""
     info = _info(served)
-    tag = etag(served, f"{info.detail} {info.robot}")
+    tag = etag(served, f"{info.detail} {info.robot} {info.cameras}")
     if (kept := unchanged(request, served, tag)) is not None:
         return kept
     response.headers.update(version_headers(served, tag))
@@ -224,7 +254,7 @@ def export_map(served: Served, request: Request, format: _FormatName) -> Respons
     | problems(404, 503),
 )
 def trajectory(served: Served, request: Request) -> Response:
-    """Return the camera's path in the map's world at the latest version."""
+    """Return the path of the first camera in the map's world at the latest version."""
     tag = etag(served, "trajectory " + request.headers.get("accept", ""))
     if (kept := unchanged(request, served, tag)) is not None:
         return kept
@@ -275,16 +305,39 @@ def _info(served: ServedMap) -> MapInfo:
         stamp=snapshot.stamp if snapshot else 0.0,
         bounds=bounds,
         robot=None if served.mask is None else _masked(served.mask),
+        cameras={name: _camera_info(served, name, state) for name, state in served.cameras.by_name.items()},
     )
+
+
+def _camera_info(served: ServedMap, name: str, state: Mapping[str, Any]) -> FurtherCameraInfo:
+    refused = None if served.mask is None else served.mask.problems.get(name)
+    return FurtherCameraInfo.model_validate({**state, "reason": refused or state["reason"]})
 
 
 def _masked(mask: RobotMask) -> RobotMaskInfo:
     return RobotMaskInfo(name=mask.robot.name, masked=mask.masked, refused=mask.refused, problem=mask.problem)
 
 
-def _mask(robot: RobotInView | None, uri: str | None) -> RobotMask | None:
-    """Return the mask of a robot in view of a camera, which the request or the recording's scene.yaml describes."""
+def _mask(service: Service, query: MapRequest, uri: str | None) -> RobotMask | None:
+    """Return the mask of a robot in view of the cameras, which the request or the recording's scene.yaml describes."""
+    robot, cameras = query.robot, query.cameras or {}
+    mounts = {name: camera.robot for name, camera in cameras.items() if camera.robot is not None}
     if robot is None:
+        if mounts:
+            field = f"cameras.{next(iter(mounts))}.robot"
+            raise InputError("needs the robot of the map.", field=field, hint="give robot, with its name")
         return None
     known = None if uri is None or uri.startswith("synthetic:") else find_workspace(uri)
-    return RobotMask(known_robot(robot.name), robot.workspace(known))
+    workspace = robot.workspace(known)
+    if uri is not None:
+        return RobotMask(known_robot(robot.name), workspace)
+    further = {name: mount.workspace(workspace) for name, mount in mounts.items()}
+    return service.mask_of_stream(query.id, known_robot(robot.name), workspace, further)
+
+
+def _with_cameras(config: Config, query: MapRequest) -> Config:
+    """Return the configuration with the cameras of a request, which replace those of the service."""
+    if query.cameras is None:
+        return config
+    settings = {name: camera.settings() for name, camera in query.cameras.items()}
+    return with_cameras(config.model_copy(update={"cameras": {}}), settings)

@@ -51,6 +51,7 @@ def serve(
         splatbot serve --map runs/demo/map.ply
         splatbot serve --log recordings/desk --port 8080
         splatbot serve --log recordings/wrist --robot panda
+        splatbot serve --log rig.yaml
         splatbot serve --camera "replay:recordings/desk?loop=1" --viewer-port 8001 --ros-port 9090
         SPLATBOT_LOG_ROOTS=recordings splatbot serve --data maps
         splatbot serve --map runs/desk --robot ur5e --arm ur:192.168.1.10
@@ -128,6 +129,8 @@ def serve(
             _add_map(runtime, map)
         elif device is not None:
             _follow(runtime, device.removeprefix(REPLAY), lambda delay: open_camera(device, joint_delay=delay))
+        elif log is not None and log_kind(log) == "rig":
+            _follow_rig(runtime, log, camera)
         elif log is not None:
             _follow(runtime, log, lambda delay: open_log(log, camera=camera, joint_delay=delay))
         run_service(runtime, on_start=partial(_announce, settings))
@@ -184,6 +187,27 @@ def _follow(runtime: Runtime, log: str, open_source: Callable[[float], Log | Fra
     source = open_source(0.0 if mask is None else mask.joint_delay)
     served = runtime.store.add(MAP_ID, source=source.name, state="mapping", workspace=workspace, mask=mask)
     runtime.follow(served, source, Slam(runtime.config))
+
+
+def _follow_rig(runtime: Runtime, log: str, camera: str | None) -> None:
+    """Map the recordings of several cameras; the robot is masked at the mount of each of them.
+
+    Raises:
+        InputError: one camera is given for all recordings.
+    """
+    from splatbot.config import with_cameras
+    from splatbot.services.mapping import open_rig
+    from splatbot.slam import Slam
+
+    if camera is not None:
+        hint = "write `camera: FILE` to each camera of the file"
+        raise InputError("each camera has its own.", field="--camera", hint=hint)
+    source, further = open_rig(log)
+    first = further.pop("")
+    workspace = runtime.workspace or first
+    mask = runtime.new_mask(workspace, further)
+    served = runtime.store.add(MAP_ID, source=source.name, state="mapping", workspace=workspace, mask=mask)
+    runtime.follow(served, source, Slam(with_cameras(runtime.config, source.cameras, file=log)))
 
 
 def _print_new_key(words: str | None) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -11,9 +12,11 @@ import pytest
 import torch
 
 from splatbot.camera import Camera
+from splatbot.config import Config
 from splatbot.errors import LogError
 from splatbot.frame import Frame
 from splatbot.gaussians import GaussianModel, Snapshot
+from splatbot.mapping.further_camera import FreeCamera, FurtherCamera
 from splatbot.services.live import LiveMapping
 from splatbot.services.store import MapStore
 from splatbot.services.topics import FRAME, RESULT, STATE, TRAJECTORY, map_topic
@@ -33,6 +36,7 @@ class _Log:
 
     def __init__(self, broken: int | None = None, error: Exception | None = None) -> None:
         self.broken, self.error = broken, error
+        self.names: dict[int, str] = {}
         self.hold = threading.Event()
         self.hold.set()
 
@@ -49,13 +53,15 @@ class _Log:
         self.hold.wait(5)
         if index == self.broken and self.error is not None:
             raise self.error
-        return Frame(float(index), np.zeros((4, 4, 3), np.uint8), np.ones((4, 4), np.float32), CAMERA, index=index)
+        rgb, depth = np.zeros((4, 4, 3), np.uint8), np.ones((4, 4), np.float32)
+        return Frame(float(index), rgb, depth, CAMERA, index=index, camera_name=self.names.get(index, ""))
 
 
 class _Mapper:
     """Adds one Gaussian per even frame, which is a keyframe."""
 
-    def __init__(self) -> None:
+    def __init__(self, *lost: int) -> None:
+        self.lost = lost
         self.frames = 0
         self.keyframes = 0
         self.finished = False
@@ -65,13 +71,22 @@ class _Mapper:
         keyframe = self.frames % 2 == 0
         self.frames += 1
         self.keyframes += keyframe
-        return FrameResult(frame.index, frame.stamp, np.eye(4), "ok", keyframe=keyframe)
+        result = FrameResult(
+            frame.index, frame.stamp, np.eye(4), "ok", keyframe=keyframe, camera_name=frame.camera_name
+        )
+        if frame.index in self.lost:
+            return replace(result, T_world_camera=None, verdict="lost", reasons=("it is dark",))
+        return result
 
     def finish(self) -> None:
         self.finished = True
 
     def close(self) -> None:
         self.closed = True
+
+    @property
+    def further_cameras(self) -> dict[str, FurtherCamera]:
+        return {"table": FreeCamera(Config())}
 
     @property
     def trajectory(self) -> Trajectory:
@@ -150,6 +165,33 @@ def test_the_bus_is_told_of_every_frame_result_state_and_trajectory() -> None:
     versions = [m.value.map_version for m in messages if m.topic == map_topic("live", STATE)]
     assert versions == [1, 2, 3, 4, 5, 6, 6]
     assert len([m for m in messages if m.topic == map_topic("live", TRAJECTORY)][-1].value.stamps) == 10
+
+
+def test_frames_of_a_further_camera_have_topics_of_their_own_and_are_counted_by_camera() -> None:
+    log = _Log()
+    log.names = {3: "table", 4: "table", 8: "table"}
+    log.hold.clear()
+    store, mapping = _follow(log, _Mapper(3, 8))
+    assert store.get("live").cameras.by_name["table"] == {
+        "kind": "free", "frames": 0, "tracked": 0, "lost": 0, "keyframes": 0, "reason": None, "pose": None,
+    }  # fmt: skip
+    with store.bus.subscribe("maps/*", capacity=1000, latched=False) as reader:
+        log.hold.set()
+        assert mapping.wait(10)
+        topics: dict[str, list[int]] = {}
+        while (message := reader.get(0)) is not None:
+            if message.topic.endswith(("frame", "result")):
+                topics.setdefault(message.topic, []).append(message.value.index)
+    own = [0, 1, 2, 5, 6, 7, 9]
+    assert topics == {
+        "maps/live/frame": own,
+        "maps/live/result": own,
+        "maps/live/cameras/table/frame": [3, 4, 8],
+        "maps/live/cameras/table/result": [3, 4, 8],
+    }
+    now = store.get("live").cameras.by_name["table"]
+    assert (now["frames"], now["tracked"], now["lost"], now["keyframes"]) == (3, 1, 2, 2)
+    assert now["reason"] == "it is dark"
 
 
 def test_a_map_that_is_deleted_while_it_is_mapped_ends_its_mapping() -> None:
