@@ -100,8 +100,8 @@ def open_without_robot(uri: str, robot: str | None, *, camera: str | None = None
 class RecordedMask:
     """Masks the robot in the frames of a recording of ROS topics.
 
-    Its joint states at the time of a frame count first. Where they are missing, or the pose of the camera on its link
-    is not known, the poses of the links are those of TF at the times of colour and depth.
+    Its joint states at the time of a frame count first. Where they are missing, TF gives the poses of the links at the
+    times of colour and depth. It always does if the pose of the camera on its link is not known.
 
     Args:
         robot: the robot.
