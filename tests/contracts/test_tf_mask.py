@@ -6,7 +6,7 @@ import base64
 import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from websockets.sync.client import connect
 from websockets.sync.connection import Connection
 
-from splatbot.client import Client
+from splatbot.client import Client, ServiceError
 from splatbot.frame import Frame
 from splatbot.geometry import inverse, rotation_to_quat
 from splatbot.mapping.selfmask import SelfMask
@@ -160,6 +160,29 @@ def test_frames_are_refused_while_tf_has_stopped_and_mapped_when_it_goes_on() ->
         robot.send(log[6])
         assert robot.counts() == (2, 2)
         assert robot.client.map("ros")["robot"]["problem"] is None
+
+
+def test_a_map_for_ros_topics_masks_a_robot_whose_camera_only_tf_places() -> None:
+    log = static_log(1.0)
+    with driving() as (_, robot):
+        robot.client.create_map("ros", robot={"name": "panda"})
+        with pytest.raises(ServiceError, match="name no frame of their camera") as pushed:
+            robot.client.push("ros", replace(log[0], stamp=START + log[0].stamp, joints=None))
+        assert pushed.value.status == 409
+        robot.send(log[1])
+        assert robot.counts() == (1, 1)
+        with pytest.raises(ServiceError, match="T_link_camera") as other:
+            robot.client.create_map("pushed", robot={"name": "panda"})
+        assert other.value.status == 422
+
+
+def test_the_links_of_a_robot_have_the_prefix_that_the_map_was_made_with() -> None:
+    log = static_log(1.0)
+    with driving() as (_, robot):
+        robot.client.create_map("ros", robot={"name": "panda", "tf_prefix": "left_"})
+        robot.send(log[1])
+        problem = robot.client.map("ros")["robot"]["problem"]
+        assert "TF has no frame left_panda_link0, left_panda_link1" in problem
 
 
 def test_an_object_that_moveit_attaches_is_masked_until_it_is_detached() -> None:
