@@ -19,7 +19,7 @@ from splatbot.slam import FrameResult
 MAX_STAMP_S = 1e11  # in the year 5138; larger numbers are not seconds
 MAX_PAUSE_S = 86_400.0  # [s] between two frames
 MAX_BEFORE_S = 0.002  # [s] by which a frame of a carried camera may be older than that of the first camera
-MAX_AFTER_S = 0.1  # [s] by which it may be newer: 3 frames at 30 Hz, over which the velocity is extrapolated
+MAX_AFTER_S = 0.1  # [s] by which it may be newer, and at most twice the interval of the first camera: extrapolation
 _MAX_INTERVAL_S = 0.1  # [s] largest time in the map between the frames before and after a jump of the clock
 _log = logging.getLogger(__name__)
 _RESYNC = "if the clock was set, POST /v1/maps/ID/resync first"
@@ -51,7 +51,8 @@ class PushedFrames:
 
     The frames of each camera come in the order of their stamps. Across cameras any order is taken, and the earliest
     frame that waits is read first. Fixed and free cameras do not depend on the others. A carried camera moves with the
-    first one. Its frame is refused more than 2 ms before, or more than 0.1 s after, the newest frame of the first one.
+    first one, and needs its pose and velocity. Its frame is refused more than 2 ms before the newest frame of the first
+    one. It is also refused more than 0.1 s, or twice the time between the first one's frames, after it.
 
     Args:
         capacity: frames of all cameras that may wait.
@@ -74,6 +75,7 @@ class PushedFrames:
         self._count = 0
         self._last: dict[str, float] = {}  # [s] newest stamp of each camera, in the time of the map
         self._first_read: float | None = None  # [s] newest stamp of the first camera that was read
+        self._first_interval = 0.0  # [s] between it and the one before
         self._interval = _MAX_INTERVAL_S
         self._offset = 0.0  # [s] from the clock of the frames to the time of the map
         self._resync = False
@@ -165,19 +167,20 @@ class PushedFrames:
                 self.refuse(waiting.index, InputError("the robot in the frame cannot be masked.", field="joints"))
                 continue
             if not waiting.frame.camera_name:
+                self._first_interval = 0.0 if self._first_read is None else waiting.stamp - self._first_read
                 self._first_read = waiting.stamp
             yield replace(masked, index=waiting.index, stamp=waiting.stamp)
 
     def _check_first_camera(self, name: str, stamp: float) -> None:
-        """Check that the first camera was read at the time [s] of a frame of a camera that it carries.
+        """Check that the pose of the first camera is known at the time [s] of a frame of a camera that it carries.
 
         Raises:
-            FirstCameraElsewhereError: it was not.
+            FirstCameraElsewhereError: it is not.
         """
         if not name or self._cameras[name].T_first_camera is None or self._first_read is None:
             return  # before the map begins, no frame of a further camera has a pose
         late = stamp - self._first_read
-        if not -MAX_BEFORE_S <= late <= MAX_AFTER_S:
+        if not -MAX_BEFORE_S <= late <= max(MAX_BEFORE_S, min(MAX_AFTER_S, 2 * self._first_interval)):
             order = "after" if late < 0 else "before"
             raise FirstCameraElsewhereError(
                 f"the newest frame of the first camera is {abs(late):.3f} s {order} it.",

@@ -109,8 +109,9 @@ _Body = Annotated[FrameRequest, Depends(body_of(FrameRequest))]
 def push_frame(request: Request, served: Served, service: Service, query: _Body) -> Response:
     """Track a frame and map it; the answer says where the camera was. 503: as many frames wait as may.
 
-    Frames of different cameras may come in any order; of those that wait, the earliest is mapped first. 409: a frame of
-    a carried camera is more than 2 ms before, or 0.1 s after, the newest frame of the first camera.
+    Frames of different cameras may come in any order; of those that wait, the earliest is mapped first. A frame of a
+    carried camera is at most 2 ms older than the newest frame of the first camera. It is at most 0.1 s, and twice the
+    time between that camera's frames, newer. Otherwise it is refused (409).
     """
     frames = service.stream(served.id)
     frames.check_camera(query.camera_name)  # before its images are decoded

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import numpy as np
@@ -15,7 +17,7 @@ import yaml
 from numpy.typing import NDArray
 
 from splatbot.cli.serve import _follow_rig
-from splatbot.client import Client, ServiceError
+from splatbot.client import Client, ServiceError, TrackedFrame
 from splatbot.config import CameraConfig
 from splatbot.errors import InputError
 from splatbot.frame import Frame
@@ -172,6 +174,38 @@ def test_a_carried_camera_is_refused_far_from_the_first_one_and_mapped_near_it(
     assert pose_distance(found, in_world(wrist(), poses[9]))[0] < 5e-3
     assert client.map("arm")["cameras"]["side"]["kind"] == "carried"
     assert client.map("arm")["cameras"]["side"]["frames"] == 2  # refused ones do not count
+
+
+def test_two_clients_that_push_a_camera_each_get_the_right_pose_or_a_refusal(client: Client) -> None:
+    T = se3_exp(np.array([0.05, -0.02, 0.01, 0.1, -0.15, 0.05]))
+    poses = [pose @ T for pose in wrist().ground_truth.T_world_camera]
+    frames = frames_of(wrist(), poses, wrist().stamps, "side", width=160, height=120)
+    client.create_map("both", cameras={"side": described(CameraConfig(T_first_camera=pose_config(T)))})
+    mapped = [Event() for _ in frames]
+
+    def push_first() -> None:
+        for frame, done in zip(wrist(), mapped, strict=True):
+            assert client.push("both", frame).verdict == "ok"
+            done.set()
+
+    def push_side() -> dict[int, TrackedFrame]:
+        found = {}
+        for k, frame in enumerate(frames[1:], 1):
+            assert mapped[k - 1].wait(30)  # a camera takes its images at their time, not before
+            try:
+                found[k] = client.push("both", frame)
+            except ServiceError as error:
+                assert error.status == 409  # noqa: PT017 - other errors are raised
+        return found
+
+    with ThreadPoolExecutor(2) as threads:
+        first, side = threads.submit(push_first), threads.submit(push_side)
+        first.result()
+        found = side.result()
+    assert found
+    for k, result in found.items():
+        assert result.T_world_camera is not None
+        assert pose_distance(result.T_world_camera, in_world(wrist(), poses[k]))[0] < 4e-3
 
 
 def test_a_frame_of_an_unknown_camera_or_of_another_size_is_refused_alone(service: Service, client: Client) -> None:

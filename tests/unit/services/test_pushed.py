@@ -119,7 +119,7 @@ def test_a_frame_of_a_carried_camera_is_read_near_the_newest_one_of_the_first_ca
 ) -> None:
     frames = PushedFrames(10, cameras=CAMERAS)
     reader = iter(frames)
-    for first in (4.0, 5.0):
+    for first in (4.94, 5.0):
         frames.push(_frame(first))
         assert next(reader).stamp == first
     carried, fixed = frames.push(_frame(stamp, name="side")), frames.push(_frame(6.0, name="table"))
@@ -131,6 +131,15 @@ def test_a_frame_of_a_carried_camera_is_read_near_the_newest_one_of_the_first_ca
     else:
         assert (read.camera_name, read.stamp) == ("side", stamp)
     assert not fixed.done()
+
+
+def test_a_carried_camera_waits_for_the_velocity_of_the_first_one_and_follows_it_for_two_of_its_frames() -> None:
+    frames = PushedFrames(10, cameras=CAMERAS)
+    for stamp, name in ((5.0, ""), (5.001, "side"), (5.01, "side"), (5.02, ""), (5.059, "side"), (5.061, "side")):
+        frames.push(_frame(stamp, name=name))
+    frames.end()
+    read = [f.stamp for f in frames]
+    assert read == [5.0, 5.001, 5.02, 5.059]
 
 
 def test_a_first_frame_that_is_refused_by_the_mask_gives_a_carried_camera_no_pose() -> None:
