@@ -75,6 +75,7 @@ def _example() -> dict[str, Any]:
     ramp = np.tile(np.linspace(0, 255, 32).astype(np.uint8)[None, :, None], (24, 1, 3))
     return {
         "stamp": 0.033,
+        "camera_name": "",
         "camera": {"fx": 30.0, "fy": 30.0, "cx": 15.5, "cy": 11.5, "width": 32, "height": 24},
         "rgb": _png64(ramp),
         "depth": _png64(np.full((24, 32), 1000, np.uint16)),
@@ -101,10 +102,7 @@ _Body = Annotated[FrameRequest, Depends(body_of(FrameRequest))]
     "/{map_id}/frames",
     response_class=Response,
     responses=answers(_ANSWER) | problems(404, 409, 413, 415, 422, 503),
-    openapi_extra=request_body(
-        FrameRequest,
-        {"a small frame": _example(), "of a further camera": _example() | {"camera_name": "table", "stamp": 0.04}},
-    ),
+    openapi_extra=request_body(FrameRequest, {"a small frame of the first camera": _example()}),
 )
 def push_frame(request: Request, served: Served, service: Service, query: _Body) -> Response:
     """Track a frame and map it; the answer says where the camera was. 503: as many frames wait as may.
