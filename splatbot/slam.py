@@ -300,13 +300,11 @@ class Slam:
 
     def _map_state(self, stamp: float) -> MapState:
         """Return the map and the first camera at a time [s], for the further cameras."""
-        first = None
-        if not self._tracker.is_lost and self._mapper.keyframes:
-            first = MeasuredPose(*self._tracker.pose_at(stamp))
+        pose = self._tracker.pose_at(stamp)
         return MapState(
             keyframes=self._mapper.keyframes,
             variance_scale=self._mapper.inconsistency,
-            first=first,
+            first=None if pose is None else MeasuredPose(*pose),
             first_twist=self._tracker.expected_twist(stamp),
         )
 

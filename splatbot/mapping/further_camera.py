@@ -33,7 +33,7 @@ class MapState:
     Args:
         keyframes: all keyframes of the map.
         variance_scale: see :attr:`splatbot.tracking.tracker.Tracker.variance_scale`.
-        first: pose of the first camera at the stamp of the frame; None while it is lost.
+        first: pose of the first camera at the stamp of the frame; None while it is lost or its motion is unknown.
         first_twist: (6,) [m/s, rad/s] velocity of the first camera in its own frame.
     """
 
@@ -97,7 +97,8 @@ class MountedCamera:
         """Return the pose of a frame; a pose that is not exact is first estimated against the map."""
         parent = state.first if self.carried else _WORLD
         if parent is None or not state.keyframes:
-            reason = "the first camera is lost" if state.keyframes else "the map has not begun"
+            unknown = "the first camera is lost, or its motion is unknown"
+            reason = unknown if state.keyframes else "the map has not begun"
             return _lost(reason)
         if not self.pose.known:
             self._estimate(prepared, config, state, parent)

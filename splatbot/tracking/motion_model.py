@@ -29,6 +29,8 @@ class MotionModelConstants:
     """Unmodelled angular acceleration [rad/s²]."""
     max_gap: float = 3.0
     """Gap between frames, in previous intervals [1], after which the velocity is no longer used."""
+    same_time: float = 2e-3
+    """Time [s] in which a camera on an arm moves by less than the error of its pose."""
 
 
 CONSTANTS = MotionModelConstants()
@@ -69,6 +71,18 @@ class ConstantVelocity:
     def predict(self, stamp: float) -> Array:
         """Return the expected T_world_camera (4, 4) at a time [s]."""
         return self.T_world_camera @ se3_exp(self._motion(stamp))
+
+    def extrapolate(self, stamp: float) -> Array | None:
+        """Return T_world_camera (4, 4) at a time [s], or None where the motion does not determine it.
+
+        The motion is known at the last pose, and for ``CONSTANTS.max_gap`` intervals after the second or a later pose.
+        """
+        if self._last is None:
+            return None
+        dt = stamp - self._last[0]
+        if abs(dt) <= CONSTANTS.same_time:
+            return self._last[1]
+        return self.predict(stamp) if 0.0 < dt <= CONSTANTS.max_gap * self._interval else None
 
     def motion_prior(self, stamp: float, last_covariance: Array) -> Prediction:
         """Predict the pose at a time [s] with its covariance; ``last_covariance`` (6, 6) is that of the last pose."""

@@ -117,12 +117,14 @@ class Tracker:
         """Return the expected twist (6,) [m/s, rad/s] of the camera at a time [s], to rectify the frame."""
         return self._velocity.at(stamp)
 
-    def pose_at(self, stamp: float) -> tuple[Array, Array]:
-        """Return the pose (4, 4) at a time [s] by the velocity, and the covariance (6, 6) of the last pose.
+    def pose_at(self, stamp: float) -> tuple[Array, Array] | None:
+        """Return the pose (4, 4) at a time [s] shortly after the last frame, and the covariance of that frame's pose.
 
-        The covariance is that of the motion against the keyframes, of the twist (t [m], ω [rad]) in the camera's frame.
+        The covariance (6, 6) is that against the keyframes, of the twist (t [m], ω [rad]) in the camera. The result is
+        None while the camera is lost or its motion is unknown.
         """
-        return self.motion.predict(stamp), self._last_covariance
+        T = None if self._lost else self.motion.extrapolate(stamp)
+        return None if T is None else (T, self._last_covariance)
 
     def keypoints(self, prepared: PreparedFrame, estimate: PoseEstimate) -> Callable[[], Features]:
         """Return a function that detects the keypoints of a frame that becomes a keyframe, in the calling thread.

@@ -108,7 +108,12 @@ RESULTS: dict[str, Callable[[Names], bool]] = {
     "docs/guide/tracking.md": lambda names: names["result"].verdict == "ok" and names["frame"].prior is not None,
     "docs/guide/twin.md": lambda names: names["result"].steps > 1000,
 }
-OF_A_SERVICE = ["docs/guide/robot-in-view.md", "docs/guide/ros.md", "docs/guide/service.md"]
+OF_A_SERVICE = [
+    "docs/guide/robot-in-view.md",
+    "docs/guide/ros.md",
+    "docs/guide/service.md",
+    "docs/guide/several-cameras.md",
+]
 OF_AN_ARM = "docs/guide/arms.md"
 
 

@@ -142,7 +142,7 @@ def test_the_cameras_have_no_pose_before_the_map_begins_or_while_the_first_camer
     black = np.zeros_like(wrist()[1].rgb), np.zeros_like(wrist()[1].depth)
     assert slam.process(replace(wrist()[1], rgb=black[0], depth=black[1])).verdict == "lost"
     side = replace(table_frames()[1], camera_name="side", stamp=0.05)
-    assert slam.process(side).reasons == ("the first camera is lost",)
+    assert slam.process(side).reasons == ("the first camera is lost, or its motion is unknown",)
 
 
 def test_a_loop_closure_moves_keyframes_gaussians_results_and_pose_of_a_fixed_camera_together() -> None:
@@ -177,3 +177,15 @@ def test_numbers_and_loops_of_the_first_camera_are_as_without_the_others() -> No
     assert own == list(range(len(own)))
     assert set(slam._mapper.loops.graph.poses) == set(own)
     assert set(slam._mapper.loops.adjacency) <= set(own)
+
+
+def test_a_carried_camera_has_no_pose_where_the_motion_of_the_first_one_is_unknown() -> None:
+    slam = Slam(Config(cameras={"side": CameraConfig(T_first_camera=pose_config(T_FIRST_CARRIED))}))
+    side = replace(table_frames()[0], camera_name="side")
+    slam.process(wrist()[0])
+    assert slam.process(replace(side, stamp=wrist()[0].stamp)).verdict == "ok"  # of the same time
+    assert slam.process(replace(side, stamp=wrist()[0].stamp + 0.01)).verdict == "lost"  # without a velocity
+    slam.process(wrist()[1])
+    assert slam.process(replace(side, stamp=wrist()[1].stamp + 0.01)).verdict == "ok"
+    assert slam.process(replace(side, stamp=wrist()[1].stamp - 0.01)).verdict == "lost"  # older than the first camera
+    assert slam.process(replace(side, stamp=wrist()[1].stamp + 0.5)).verdict == "lost"  # a gap
