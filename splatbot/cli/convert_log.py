@@ -82,6 +82,9 @@ def convert_log(
     from splatbot.logs.base import FirstFrames
 
     whole = open_log(log, camera=camera)
+    if whole.cameras:
+        hint = "convert the recording of each camera, and name the new ones in a file of your own"
+        raise InputError("lists several cameras.", file=log, field="LOG", hint=hint)
     source = FirstFrames(whole, len(whole) if frames is None else frames)
     with shares(quiet) as show:
         _write(source, out, layout, depth_scale, lambda done: show("writing", done / len(source)))

@@ -200,6 +200,7 @@ def describe_log(log: Log) -> list[tuple[str, str]]:
     length = float(np.linalg.norm(np.diff(truth.positions, axis=0), axis=1).sum()) if truth is not None else None
     return [
         ("frames", str(n)),
+        *_cameras_of(log),
         ("duration", f"{duration:.2f} s"),
         ("rate", f"{(n - 1) / duration:.1f} Hz" if duration > 0 else NONE),
         ("image", f"{c.width}x{c.height}"),
@@ -211,6 +212,21 @@ def describe_log(log: Log) -> list[tuple[str, str]]:
         *(("question", doubt) for doubt in camera_doubts(c)),
         *(("simulated effect", f"{effect['name']} ({effect['why']})") for effect in log.effects),
     ]
+
+
+def _cameras_of(log: Log) -> list[tuple[str, str]]:
+    """Return a row for each camera of a rig: frames, size and the kind of its pose."""
+    from splatbot.config import Config, with_cameras
+    from splatbot.logs.rig import RigLog
+
+    if not isinstance(log, RigLog):
+        return []
+    cameras, rows = with_cameras(Config(), log.cameras, file=log.uri).cameras, []
+    for part in log.parts:
+        c, settings = part.log.camera, cameras.get(part.name)
+        kind = "first" if settings is None else settings.kind
+        rows.append((f"camera {part.name}", f"{kind}, {len(part.log)} frames, {c.width}x{c.height}"))
+    return rows
 
 
 def shift_text(shift: tuple[int, int] | None, width: int) -> str:

@@ -328,6 +328,13 @@ class CameraConfig(_Section):
     )
     sensor: SensorConfig = Field(default_factory=SensorConfig)
 
+    @property
+    def kind(self) -> Literal["fixed", "carried", "free"]:
+        """Kind of the camera by the pose that is given."""
+        if self.T_world_camera is not None:
+            return "fixed"
+        return "free" if self.T_first_camera is None else "carried"
+
     @model_validator(mode="after")
     def _one_pose(self) -> CameraConfig:
         if self.T_world_camera is not None and self.T_first_camera is not None:

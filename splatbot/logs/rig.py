@@ -57,6 +57,9 @@ class RigLog(StampedLog):
     Frames of the first camera have no ``camera_name``; the others have the name of their camera. Name, intrinsics,
     calibration and reference poses of the log are those of the first camera.
 
+    Attributes:
+        parts: the cameras with their recordings, the first one first.
+
     Args:
         path: YAML file with the mapping ``cameras`` from names to ``log``, ``camera``, ``time_offset`` and the keys of
             the section ``cameras`` of the configuration. Paths are relative to the file.
@@ -71,27 +74,27 @@ class RigLog(StampedLog):
         self.uri, self.name = str(path), Path(path).stem
         self._file = Path(path)
         entries = _entries(self._file)
-        self._parts = [self._part(name, values, opener) for name, values in entries.items()]
-        self._cameras = {part.name: _settings(part, entries[part.name]) for part in self._parts[1:]}
-        ordered = sorted((t, k, i) for k, part in enumerate(self._parts) for i, t in enumerate(part.stamps))
+        self.parts = [self._part(name, values, opener) for name, values in entries.items()]
+        self._cameras = {part.name: _settings(part, entries[part.name]) for part in self.parts[1:]}
+        ordered = sorted((t, k, i) for k, part in enumerate(self.parts) for i, t in enumerate(part.stamps))
         self.stamps = [stamp for stamp, _, _ in ordered]
         self._places = [(part, index) for _, part, index in ordered]
 
     @property
     def camera(self) -> Camera:
         """Camera of the frames of the first camera: undistorted."""
-        return self._parts[0].log.camera
+        return self.parts[0].log.camera
 
     @property
     def ground_truth(self) -> Trajectory | None:
         """Reference poses of the first camera, see :class:`splatbot.logs.Log`."""
-        truth, offset = self._parts[0].log.ground_truth, self._parts[0].time_offset
+        truth, offset = self.parts[0].log.ground_truth, self.parts[0].time_offset
         return truth if truth is None or not offset else replace(truth, stamps=truth.stamps + offset)
 
     @property
     def effects(self) -> list[dict[str, Any]]:
         """Records of the simulated effects of the first camera."""
-        return self._parts[0].log.effects
+        return self.parts[0].log.effects
 
     @property
     def cameras(self) -> Mapping[str, Mapping[str, Any]]:
@@ -101,11 +104,11 @@ class RigLog(StampedLog):
     @property
     def calibration(self) -> Calibration:
         """Calibration of the first camera."""
-        return self._parts[0].log.calibration
+        return self.parts[0].log.calibration
 
     def _decode(self, index: int) -> Frame:
         number, at = self._places[index]
-        part = self._parts[number]
+        part = self.parts[number]
         frame = part.log.read(at)
         name = part.name if number else ""
         return replace(frame, index=index, stamp=frame.stamp + part.time_offset, camera_name=name)

@@ -130,3 +130,13 @@ def test_depth_in_metres_is_written_in_a_finer_unit(run: RunCommand, tmp_path: P
     assert run("convert-log", folder, tmp_path / "fine").code == 0
     for a, b in zip(frames, open_log(tmp_path / "fine"), strict=True):
         np.testing.assert_allclose(b.depth, a.depth, atol=1.1e-4)
+
+
+def test_several_cameras_are_not_written_as_one(run: RunCommand, tmp_path: Path, frames: list[Frame]) -> None:
+    record(frames, tmp_path / "log")
+    (tmp_path / "rig.yaml").write_text("cameras: {wrist: {log: log}, table: {log: log}}")
+    assert_refused(run("convert-log", tmp_path / "rig.yaml", tmp_path / "copy"), "lists several cameras")
+    assert not (tmp_path / "copy").exists()
+    answer = run("info", tmp_path / "rig.yaml")
+    assert answer.code == 0
+    assert "free, 4 frames, 64x48" in answer.out
