@@ -33,7 +33,7 @@ COLMAP_DEPTH = ("depth", "depths")
 MAP_NAME = "map.ply"
 RECORDING = "recording.mcap"
 TRAINING_NAME = "training.json"
-MAP_SUFFIXES = (".ply", ".splat", ".spz", ".sog", ".glb")
+MAP_SUFFIXES = (".ply", ".splat", ".spz", ".sbz", ".sog", ".glb")
 """Ends of the names of map files that splatbot.formats reads."""
 
 _SOG_NAME = "meta.json"  # of a map in a folder of WebP images

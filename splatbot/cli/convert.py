@@ -28,14 +28,15 @@ def convert(
 ) -> int:
     """Write a map in another format of Gaussian splats, as the suffix of OUT says.
 
-    The suffixes are .ply (3DGS PLY), .compressed.ply, .splat, .spz, .sog, _sog (a folder) and .glb (glTF with
+    The suffixes are .ply (3DGS PLY), .compressed.ply, .splat, .spz, .sbz, .sog, _sog (a folder) and .glb (glTF with
     KHR_gaussian_splatting). The format of MAP is detected from its content.
 
-    Prints the losses. Only .ply keeps all values, and the bookkeeping of splatbot: observations, anchors, uncertainty
-    and misses of each Gaussian.
+    Prints the losses. Only .ply keeps all values. The bookkeeping of splatbot (observations, anchors, uncertainty and
+    misses of each Gaussian) is kept by .ply and .sbz.
 
     Examples:
         splatbot convert runs/desk desk.spz
+        splatbot convert runs/desk desk.sbz
         splatbot convert scene.sog scene.ply
         splatbot convert map.ply map.compressed.ply --sh-degree 0
         splatbot convert map.ply map.spz --spz-version 4
@@ -102,7 +103,7 @@ def _has_bookkeeping(model: GaussianModel) -> bool:
 
 def _losses(model: GaussianModel, kept: GaussianModel, target: MapFormat) -> list[str]:
     lost = [f"SH degree {model.sh_degree} to {kept.sh_degree}"] if kept.sh_degree < model.sh_degree else []
-    lost += ["bookkeeping"] if target.module != "ply" and _has_bookkeeping(model) else []
+    lost += ["bookkeeping"] if not target.has_bookkeeping and _has_bookkeeping(model) else []
     notes = [f"lost: {', '.join(lost)}"] if lost else []
     rounded = [target.rounded] if target.rounded else []
     rounded += ["harmonics"] if rounded and kept.sh_degree else []

@@ -26,6 +26,7 @@ class MapFormat:
         module: module of this package that has ``load_MODULE`` and ``save_MODULE``.
         max_sh_degree: the highest SH degree that it stores.
         rounded: the values that it does not store as float32, for users.
+        has_bookkeeping: whether it stores observations, anchors, uncertainty and misses.
     """
 
     name: str
@@ -33,6 +34,7 @@ class MapFormat:
     module: str
     max_sh_degree: int
     rounded: str = ""
+    has_bookkeeping: bool = False
 
     def load(self, path: str | Path) -> GaussianModel:
         """Read a file that is of this format."""
@@ -52,9 +54,10 @@ class MapFormat:
 _ALL = "positions, scales, rotations, colours, opacities"
 FORMATS = (
     MapFormat("compressed PLY", ".compressed.ply", "compressed_ply", 3, _ALL),
-    MapFormat("3DGS PLY", ".ply", "ply", 4),
+    MapFormat("3DGS PLY", ".ply", "ply", 4, has_bookkeeping=True),
     MapFormat(".splat", ".splat", "splat", 0, "rotations, colours, opacities"),
     MapFormat("SPZ", ".spz", "spz", 4, _ALL),
+    MapFormat("SBZ", ".sbz", "sbz", 0, f"{_ALL}, uncertainty", has_bookkeeping=True),
     MapFormat("SOG", ".sog", "sog", 3, _ALL),
     MapFormat("SOG folder", "_sog", "sog", 3, _ALL),
     MapFormat("glTF with KHR_gaussian_splatting", ".glb", "glb", 3),
@@ -66,7 +69,7 @@ WRITTEN = tuple(entry.suffix[1:] for entry in FORMATS if entry.suffix.startswith
 
 _KNOWN = ", ".join(f"{entry.name} ({entry.suffix})" for entry in FORMATS)
 _BY_MODULE = {entry.module: entry for entry in reversed(FORMATS)}
-_MAGIC = {b"ply": "ply", b"NGSP": "spz", b"\x1f\x8b": "spz", b"PK": "sog", b"{": "sog", b"glTF": "glb"}
+_MAGIC = {b"ply": "ply", b"NGSP": "spz", b"SBZ": "sbz", b"\x1f\x8b": "spz", b"PK": "sog", b"{": "sog", b"glTF": "glb"}
 
 
 def load_gaussians(path: str | Path) -> GaussianModel:

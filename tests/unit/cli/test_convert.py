@@ -28,6 +28,11 @@ def source(work_folder: Path) -> Path:
         ("out.splat", 0, "lost: SH degree 2 to 0, bookkeeping; rounded: rotations, colours, opacities"),
         ("out.spz", 2, "lost: bookkeeping; rounded: positions, scales, rotations, colours, opacities, harmonics"),
         ("out.compressed.ply", 2, "lost: bookkeeping; rounded: positions"),
+        (
+            "out.sbz",
+            0,
+            "lost: SH degree 2 to 0; rounded: positions, scales, rotations, colours, opacities, uncertainty",
+        ),
         ("out.sog", 2, "lost: bookkeeping; rounded: positions"),
         ("new/out_sog", 2, "lost: bookkeeping; rounded: positions"),
     ],
