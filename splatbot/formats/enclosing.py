@@ -24,8 +24,8 @@ MAX_VALUE = 1e6  # [m] largest mean and scale of a collision field
 SLACK = 2.0**-10  # share of the semi-axes that is left for the float32 rounding of a field
 
 SCALE_STEPS = 12  # of an octave
-OFFSET_STEPS = np.array([0.1, 0.1, 0.2])  # of a scale, from long to thin
-TILT_STEPS, TWIST_STEPS = 10.0, 12.0  # of X and Y, and of T, times r - 1 / r for a ratio r of scales
+OFFSET_STEPS = np.array([0.08, 0.08, 0.16])  # of a scale, from long to thin
+TILT_STEPS, TWIST_STEPS = 12.0, 16.0  # of X and Y, and of T, times r - 1 / r for a ratio r of scales
 MAX_TURN_BITS = 22
 
 MIN_CODE = int(np.floor(SCALE_STEPS * np.log2(SCALE_FLOOR)))
