@@ -49,6 +49,8 @@ class FrameResult:
         skipped: tracking stages that did not fit the time budget.
         covariance: (6, 6) of the pose, see :attr:`splatbot.tracking.estimate.PoseEstimate.covariance`; None when lost.
         camera_name: name of the camera; empty for the first one.
+        anchor: number of the first camera's keyframe that a pose of another camera moves with. If None, the pose moves
+            with the keyframe at its time.
     """
 
     index: int
@@ -63,6 +65,7 @@ class FrameResult:
     skipped: tuple[str, ...] = ()
     covariance: NDArray[np.float64] | None = None
     camera_name: str = ""
+    anchor: int | None = None
 
 
 class Slam:
@@ -184,14 +187,14 @@ class Slam:
         for result in self.results:
             number += result.keyframe and not result.camera_name
             if result.T_world_camera is not None:
-                T_new_old = correction.get(self._moves_with(result.camera_name, number), still)
+                T_new_old = correction.get(number if result.anchor is None else result.anchor, still)
                 result = replace(result, T_world_camera=T_new_old @ result.T_world_camera)
             results.append(result)
         self.results = results
         if number in correction:
             self._tracker.move(correction[number])
-        for name, camera in self._further_cameras.items():
-            camera.move(correction.get(self._moves_with(name, number), still))
+        for camera in self._further_cameras.values():
+            camera.move(correction.get(number if camera.anchor is None else camera.anchor, still))
 
     def close(self) -> None:
         """End the mapping thread, if there is one, once all submitted keyframes are in the map."""
@@ -312,11 +315,6 @@ class Slam:
         cameras = self.config.cameras.items()
         return {name: make_camera(camera, self.config.of_camera(name)) for name, camera in cameras}
 
-    def _moves_with(self, camera_name: str, number: int) -> int:
-        """Return the keyframe of the first camera that a pose moves with: ``number``, or that of a fixed camera."""
-        anchor = self._further_cameras[camera_name].anchor if camera_name else None
-        return number if anchor is None else anchor
-
     def _rectified_first(self, estimate: PoseEstimate, stamp: float) -> PreparedFrame | None:
         """Return the first frame rectified by its velocity, if the second one reveals that the camera moved during it.
 
@@ -338,6 +336,8 @@ class Slam:
         version, self._mapper = self._mapper.version, Mapper(self.config)
         self._mapper.version = version
         self._tracker, self._quality = Tracker(self.config.tracking), FrameQuality()
+        self._further_cameras = self._make_further_cameras()
+        self.results = [replace(r, keyframe=False) if r.camera_name else r for r in self.results]
         self._location = GraphLocation()
         self._location = self._mapper.submit(self._observation(first, self._tracker.start(first), hold_out=False))
         self._executor.run()
@@ -385,6 +385,7 @@ class Slam:
             skipped=estimate.skipped,
             covariance=None if lost else estimate.covariance,
             camera_name=frame.camera_name,
+            anchor=self._further_cameras[frame.camera_name].anchor if frame.camera_name else None,
         )
         self.results.append(result)
         if estimate.stage_ms and not frame.camera_name:

@@ -249,7 +249,7 @@ def _views(map_: Path, indices: tuple[int, ...]) -> list[ObservedView]:
     run = RunFolder(map_)
     poses = run.load_poses()
     log = reopen_log(run)
-    camera, views = replace(log.camera, distortion=()), []
+    views = []
     mapped = rectified_log(run, log) if len(indices) > 1 else None  # its depth is compared with several masks
     for index in indices:
         if index not in poses:
@@ -259,7 +259,8 @@ def _views(map_: Path, indices: tuple[int, ...]) -> list[ObservedView]:
         if mapped is not None:
             frame = mapped[index]
             depth = np.where(frame.valid, frame.depth, np.float32(0))
-        views.append(ObservedView(camera, poses[index], log[index].rgb, depth))
+        seen = log[index]
+        views.append(ObservedView(replace(seen.camera, distortion=()), poses[index], seen.rgb, depth))
     return views
 
 

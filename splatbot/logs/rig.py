@@ -47,7 +47,8 @@ class RigCamera:
     @property
     def stamps(self) -> list[float]:
         """Stamps of the frames [s]; a recording that does not know them is decoded."""
-        known = self.log.stamps if isinstance(self.log, StampedLog) else [frame.stamp for frame in self.log]
+        known: list[float] | None = getattr(self.log, "stamps", None)
+        known = [frame.stamp for frame in self.log] if known is None else known
         return [stamp + self.time_offset for stamp in known]
 
 
@@ -78,6 +79,7 @@ class RigLog(StampedLog):
         self._cameras = {part.name: _settings(part, entries[part.name]) for part in self.parts[1:]}
         ordered = sorted((t, k, i) for k, part in enumerate(self.parts) for i, t in enumerate(part.stamps))
         self.stamps = [stamp for stamp, _, _ in ordered]
+        self._check_overlap()
         self._places = [(part, index) for _, part, index in ordered]
 
     @property
@@ -133,14 +135,40 @@ class RigLog(StampedLog):
         path, mark, options = str(local).partition("?")
         return path + mark + options if Path(path).exists() or local.exists() else address
 
+    def _check_overlap(self) -> None:
+        """Refuse a camera that has no frame during the recording of the first one."""
+        begin, end = self.parts[0].stamps[0], self.parts[0].stamps[-1]
+        for part in self.parts[1:]:
+            first, last = part.stamps[0], part.stamps[-1]
+            if last < begin or first > end:
+                spans = f"from {first:.3f} to {last:.3f} s, the first camera from {begin:.3f} to {end:.3f} s."
+                hint = "give time_offset [s], which is added to its stamps"
+                raise self._wrong(f"cameras.{part.name}", f"has frames {spans}", hint)
+
     def _wrong(self, field: str, message: str, hint: str) -> LogError:
         return LogError(message, file=self._file, field=field, hint=hint)
+
+
+class _UniqueKeys(yaml.SafeLoader):
+    """Refuses a mapping with a repeated key, of which YAML keeps the last one only."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """Return the mapping of a node.
+
+        Raises:
+            yaml.YAMLError: a key is repeated.
+        """
+        keys = [key.value for key, _ in node.value]
+        for key in keys:
+            if keys.count(key) > 1:
+                raise yaml.constructor.ConstructorError(None, None, f"the key {key!r:.40} is repeated", node.start_mark)
+        return super().construct_mapping(node, deep)
 
 
 def _entries(file: Path) -> dict[str, dict[str, Any]]:
     """Return the values of each camera of a file, the first one first."""
     try:
-        found = yaml.safe_load(file.read_text(encoding="utf-8"))
+        found = yaml.load(file.read_text(encoding="utf-8"), Loader=_UniqueKeys)
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise LogError(f"is no YAML file: {error}.", file=file, hint=_HINT) from error
     cameras = found.get("cameras") if isinstance(found, dict) else None

@@ -184,38 +184,54 @@ class ConstantPose:
     tried: int = 0
 
     def __post_init__(self) -> None:
-        self.known = self.known or self.sigma == (0.0, 0.0)
+        self.known = self.known or self.is_exact
 
     def start(self) -> Array:
         """Return the start (4, 4) on the parent for the next frame."""
         displacement = _SIGNS[self.tried % len(_SIGNS)] * np.repeat(self.sigma, 3)
         return np.asarray(self.T_parent_camera @ se3_exp(displacement))
 
-    def add(self, found: MeasuredPose | str) -> None:
-        """Add the pose (4, 4) of a frame on the parent, or the reason why it has none."""
+    @property
+    def is_exact(self) -> bool:
+        """Return whether the pose is given without an error."""
+        return self.sigma == (0.0, 0.0)
+
+    @property
+    def is_full(self) -> bool:
+        """Return whether enough frames are measured: if the pose is unknown, they do not agree."""
+        return len(self.measured) >= CONSTANTS.agreeing
+
+    def add(self, found: MeasuredPose | str) -> bool:
+        """Add the pose (4, 4) of a frame on the parent, or the reason why it has none; return whether it is known."""
         self.tried += 1
         if isinstance(found, str):
             self.reason = found
-            return
+            return False
         self.measured = [*self.measured, found][-CONSTANTS.agreeing :]
         if len(self.measured) < CONSTANTS.agreeing:
             self.reason = f"{len(self.measured)} of {CONSTANTS.agreeing} frames are aligned to the map"
-            return
+            return False
         T, covariance = fused(self.measured)
         if not all(is_within(pose_distance(T, m.T_world_camera), CONSTANTS.agreement) for m in self.measured):
             self.reason = "the poses of its frames contradict each other"
-            return
+            return False
         deviation = np.abs(se3_log(inverse(self.T_parent_camera) @ T)) / np.repeat(self.sigma, 3)
         if deviation.max() > CONSTANTS.gate:
             self.reason = f"the map implies a pose {deviation.max():.0f} σ from the given one"
-            return
+            return False
         self.T_parent_camera, self.covariance = T, covariance
         self.known, self.measured = True, []
+        return True
+
+    def forget(self) -> None:
+        """Make the pose the start of a new estimate: the camera has moved."""
+        self.known, self.measured = False, []
 
     def move(self, T_new_old: Array) -> None:
-        """Move the pose with a correction (4, 4) of its parent frame."""
-        self.T_parent_camera = T_new_old @ self.T_parent_camera
+        """Move a known pose with a correction (4, 4) of the map; a given one refers to the origin and stays."""
         self.measured = []
+        if self.known:
+            self.T_parent_camera = T_new_old @ self.T_parent_camera
 
 
 def fused(poses: Sequence[MeasuredPose]) -> tuple[Array, Array]:

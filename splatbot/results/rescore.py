@@ -10,7 +10,7 @@ from splatbot.logs import Log
 from splatbot.results.folder import RunFolder
 from splatbot.results.metrics import without_nan
 from splatbot.results.scoring import score_trajectory, score_views, trajectory_metrics
-from splatbot.tracking.rectify import RectifiedLog
+from splatbot.results.views import rectified_log
 from splatbot.trajectory import Trajectory
 
 
@@ -45,7 +45,7 @@ def rescore(folder: RunFolder, log: Log, reference: Trajectory | None = None) ->
     )
     held_out = {row.index: poses[row.index] for row in rows if row.held_out and row.index in poses}
     model = GaussianModel.load(folder.map)
-    rectified = RectifiedLog(log, folder.load_config(), folder.load_trajectories())
+    rectified = rectified_log(folder, log)
     views = score_views(rectified, model, held_out)
     counts = {
         "frames": sum(row.processed for row in rows),

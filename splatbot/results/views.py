@@ -9,6 +9,7 @@ import numpy as np
 
 from splatbot.camera import Camera
 from splatbot.collision.visibility import DepthView
+from splatbot.errors import FormatError
 from splatbot.logs import Log
 from splatbot.protocols import Array
 from splatbot.results.folder import RunFolder
@@ -32,6 +33,9 @@ class DepthViewConstants:
 
 
 CONSTANTS = DepthViewConstants()
+
+SAME_STAMP_S = 1e-6
+"""Difference [s] of stamps that are the same after they were written as text."""
 
 
 def depth_views(run: RunFolder, log: Log) -> Iterator[DepthView]:
@@ -122,6 +126,32 @@ def _views(run: RunFolder, log: Log, poses: Mapping[int, Array], indices: Sequen
         yield usable_depth(frame, config), frame.camera, poses[index]
 
 
+def check_cameras(run: RunFolder, log: Log) -> None:
+    """Check that the log of several cameras has the frames of a run at the same places.
+
+    Raises:
+        FormatError: it lists other cameras, or a frame has another stamp or camera.
+    """
+    stamps: list[float] | None = getattr(log, "stamps", None)
+    rows = run.load_frames()
+    names = {row.camera_name for row in rows} - {""}
+    hint = "restore the file of the cameras, or map the log again"
+    if not names <= log.cameras.keys():
+        lost = min(names - log.cameras.keys())
+        raise FormatError(f"has frames of {lost!r}, which {log.uri} does not list.", file=run.frames, hint=hint)
+    if not names or stamps is None:
+        return
+    for row in rows:
+        if row.stamp is not None and (row.index >= len(stamps) or abs(stamps[row.index] - row.stamp) > SAME_STAMP_S):
+            changed = f"has frame {row.index} at {row.stamp:.6f} s, which {log.uri} does not have there."
+            raise FormatError(changed, file=run.frames, hint=hint)
+
+
 def rectified_log(run: RunFolder, log: Log) -> RectifiedLog:
-    """Return the frames as the run mapped them: moved to their stamps by its trajectories."""
+    """Return the frames as the run mapped them: moved to their stamps by its trajectories.
+
+    Raises:
+        FormatError: the folder is damaged, or the log lists other cameras or stamps than the run.
+    """
+    check_cameras(run, log)
     return RectifiedLog(log, run.load_config(), run.load_trajectories())

@@ -102,6 +102,9 @@ def map_log(
         slam.localise_only(config)
     config = config or (slam.config if slam else Config())
     if slam is None:
+        if log.cameras and config.cameras:
+            hint = "leave `cameras` out of the configuration, or give the recording of one camera"
+            raise InputError("describes its cameras itself.", file=log.uri, field="cameras", hint=hint)
         config = with_sensor(config, log.calibration.sensor, file=log.calibration.file)
         config = with_cameras(config, log.cameras, file=log.uri)
     if not log.cameras.keys() <= config.cameras.keys():

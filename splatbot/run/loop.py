@@ -48,6 +48,7 @@ class FrameLoop:
         held_out: frames that the map does not use.
         skipped: reason why a frame could not be read, by frame.
         keyframes, lost: counts so far.
+        seen: number of processed frames of each camera, where there are several.
         error: the unreadable frame that ended the log.
         crash: the unexpected exception that ended the loop.
         first_bad: the first unreadable frame.
@@ -65,6 +66,7 @@ class FrameLoop:
     skipped: dict[int, str] = field(default_factory=dict)
     keyframes: int = 0
     lost: int = 0
+    seen: dict[str, int] = field(default_factory=dict)
     error: InputError | None = None
     crash: Exception | None = None
     first_bad: InputError | None = None
@@ -147,8 +149,11 @@ class FrameLoop:
         return True
 
     def _process(self, frame: Frame, index: int) -> FrameResult:
-        every = self.config.mapping.holdout_every
-        hold_out = every > 0 and index % every == every - 1
+        every, number = self.config.mapping.holdout_every, index
+        if self.config.cameras:
+            number = self.seen.get(frame.camera_name, 0)
+            self.seen[frame.camera_name] = number + 1
+        hold_out = every > 0 and number % every == every - 1
         if hold_out:
             self.held_out.add(index)
         start = time.perf_counter()

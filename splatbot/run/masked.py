@@ -23,6 +23,8 @@ class MaskedLog(DerivedLog):
     def __init__(self, log: Log, mask: Callable[[Frame], Frame]) -> None:
         super().__init__(log)
         self._mask = mask
+        self.stamps: list[float] | None = getattr(log, "stamps", None)
+        """Stamps of the frames [s], where the log knows them without decoding."""
 
     def _decode(self, index: int) -> Frame:
         frame = self._log[index]

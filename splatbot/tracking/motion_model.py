@@ -84,6 +84,12 @@ class ConstantVelocity:
             return self._last[1]
         return self.predict(stamp) if 0.0 < dt <= CONSTANTS.max_gap * self._interval else None
 
+    def extrapolation_covariance(self, stamp: float) -> Array:
+        """Return the covariance (6, 6) by which unmodelled accelerations add to the last pose until a time [s]."""
+        dt = max(stamp - self._last[0], 0.0) if self._last is not None else 0.0
+        sigma = 0.5 * dt**2 * np.array(3 * [CONSTANTS.acceleration] + 3 * [CONSTANTS.angular_acceleration])
+        return np.diag(sigma**2)
+
     def motion_prior(self, stamp: float, last_covariance: Array) -> Prediction:
         """Predict the pose at a time [s] with its covariance; ``last_covariance`` (6, 6) is that of the last pose."""
         motion = self._motion(stamp)

@@ -97,6 +97,11 @@ class Tracker:
         """True if the last frame could not be tracked."""
         return self._lost
 
+    @property
+    def awaits_confirmation(self) -> bool:
+        """True if the camera was found again, and the next frame must confirm its pose."""
+        return self._candidate is not None
+
     def record_overhead(self, ms: float) -> None:
         """Record the time [ms] that a frame took outside the stages, for the budgets of later frames."""
         if self._costs is not None:
@@ -120,11 +125,12 @@ class Tracker:
     def pose_at(self, stamp: float) -> tuple[Array, Array] | None:
         """Return the pose (4, 4) at a time [s] shortly after the last frame, and the covariance of that frame's pose.
 
-        The covariance (6, 6) is that against the keyframes, of the twist (t [m], ω [rad]) in the camera. The result is
-        None while the camera is lost or its motion is unknown.
+        The covariance (6, 6) is that against the keyframes, of the twist (t [m], ω [rad]) in the camera. It grows with
+        the extrapolation: an acceleration a has the standard deviation a dt² / 2. The result is None while the camera
+        is lost or its motion is unknown.
         """
         T = None if self._lost else self.motion.extrapolate(stamp)
-        return None if T is None else (T, self._last_covariance)
+        return None if T is None else (T, self._last_covariance + self.motion.extrapolation_covariance(stamp))
 
     def keypoints(self, prepared: PreparedFrame, estimate: PoseEstimate) -> Callable[[], Features]:
         """Return a function that detects the keypoints of a frame that becomes a keyframe, in the calling thread.

@@ -96,7 +96,7 @@ TYPES: Mapping[str, SavedType] = {
         create=Slam,
         added=frozenset({"quality", "further_cameras"}),
     ),
-    "frame_result": _dataclass(FrameResult, "camera_name"),
+    "frame_result": _dataclass(FrameResult, "camera_name", "anchor"),
     "graph_location": _dataclass(GraphLocation),
     "joint_motion": SavedType(JointMotionMonitor, _fields("still_speed", "_last")),
     "camera": _dataclass(Camera),
@@ -147,8 +147,10 @@ TYPES: Mapping[str, SavedType] = {
     "adam": SavedType(GaussianAdam, _fields("rates", "steps", "skipped", "first", "second")),
     "dynamic_objects": SavedType(DynamicObjectFilter, _fields("timeout=timeout_s", "_cells", "_since", "_seen")),
     "depth_noise": _dataclass(DepthNoiseModel),
-    "mounted_camera": SavedType(MountedCamera, _fields("pose", "carried", "anchor", "_retry_at")),
-    "free_camera": SavedType(FreeCamera, _fields("tracker", "anchor")),
+    "mounted_camera": SavedType(
+        MountedCamera, _fields("pose", "carried", "anchor", "_retry_at", "_check_at", "_misses")
+    ),
+    "free_camera": SavedType(FreeCamera, _fields("tracker", "anchor", "_confirmed", "_retry_at")),
     "constant_pose": _dataclass(ConstantPose),
     "measured_pose": _dataclass(MeasuredPose),
     "tracker": SavedType(

@@ -78,32 +78,35 @@ class RunFrames:
 
     def __init__(self, log: Log, scale: int) -> None:
         self._read: Callable[[int], Frame] = lru_cache(maxsize=1)(log.read)
-        self._size = scaled_size(log.camera, scale)
-        self._camera = log.camera.resized(*self._size)
+        self._scale = scale
+        self._camera = None if log.cameras else log.camera
         self._lens = Lens(log.calibration.camera)
 
     def view(self, index: int, T_world_camera: NDArray[np.float64]) -> TrainingView:
         """Return the view of frame ``index`` of the log, with its pose (4, 4)."""
         color, depth, mask = partial(self.color, index), partial(self.depth, index), partial(self.mask, index)
-        return TrainingView(_name(index), self._camera, T_world_camera, color, depth, mask)
+        camera = self._camera or self._read(index).camera
+        camera = camera.resized(*scaled_size(camera, self._scale))
+        return TrainingView(_name(index), camera, T_world_camera, color, depth, mask)
 
     def color(self, index: int) -> NDArray[np.uint8]:
         """Read the colour image (H, W, 3) of a frame."""
-        return np.asarray(scaled(self._read(index).rgb, self._size), dtype=np.uint8)
+        frame = self._read(index)
+        return np.asarray(scaled(frame.rgb, scaled_size(frame.camera, self._scale)), dtype=np.uint8)
 
     def depth(self, index: int) -> NDArray[np.float32]:
         """Read depth (H, W) [m] of a frame, 0 where masked."""
         frame = self._read(index)
         depth = np.where(frame.valid, frame.depth, np.float32(0))
-        return scaled_depth(depth, self._size)
+        return scaled_depth(depth, scaled_size(frame.camera, self._scale))
 
     def mask(self, index: int) -> NDArray[np.bool_]:
         """Read the mask (H, W) of a frame, True where it is masked or the recorded image had no pixel."""
         frame = self._read(index)
         mask = np.zeros(frame.depth.shape, bool) if frame.mask is None else ~frame.mask
-        if self._lens.distorts:
+        if self._lens.distorts and not frame.camera_name:
             mask = mask | unseen(self._lens)
-        return scaled_mask(mask, self._size)
+        return scaled_mask(mask, scaled_size(frame.camera, self._scale))
 
 
 def _name(index: int) -> str:

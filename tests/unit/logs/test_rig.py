@@ -7,10 +7,11 @@ from pathlib import Path
 import pytest
 
 from splatbot.config import Config, with_cameras
-from splatbot.errors import ConfigError, LogError
+from splatbot.errors import ConfigError, InputError, LogError
 from splatbot.logs import open_log
 from splatbot.logs.base import FirstFrames
 from splatbot.logs.rig import MAX_CAMERAS
+from splatbot.run import map_log
 from tests.conftest import MakeLog
 
 WRIST = "synthetic:tabletop?frames=4&width=160&height=120"
@@ -59,13 +60,19 @@ def test_a_further_camera_has_its_own_sensor_with_the_calibrated_values_of_its_r
     assert config.sensor.max_depth == Config().sensor.max_depth
 
 
-def test_the_cameras_of_the_configuration_win_over_those_of_the_file(tmp_path: Path) -> None:
+def test_cameras_are_described_in_one_place(tmp_path: Path) -> None:
     log = open_log(write(tmp_path, f'cameras: {{a: {{log: "{WRIST}"}}, b: {{log: "{TABLE}"}}}}'))
-    pose = {"translation": [1.0, 0.0, 0.0], "quaternion_wxyz": [2.0**-0.5, 0.0, 0.0, 2.0**-0.5]}
-    config = with_cameras(Config.model_validate({"cameras": {"b": {"T_world_camera": pose}}}), log.cameras)
-    given = config.cameras["b"].T_world_camera
-    assert given is not None
-    assert given.translation == (1.0, 0.0, 0.0)
+    config = Config.model_validate({"cameras": {"b": {}}})
+    with pytest.raises(InputError, match="describes its cameras itself"):
+        map_log(log, out=tmp_path / "run", config=config)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_camera_without_a_frame_during_the_recording_of_the_first_one_is_refused(tmp_path: Path) -> None:
+    rig = f'cameras: {{a: {{log: "{WRIST}"}}, b: {{log: "{TABLE}", time_offset: 5}}}}'
+    with pytest.raises(LogError, match=r"from 5\.000 to 5\.067 s") as caught:
+        open_log(write(tmp_path, rig))
+    assert caught.value.field == "cameras.b"
 
 
 POSE = "{translation: [0, 0, 0], quaternion_wxyz: [1, 0, 0, 0]}"
@@ -107,11 +114,12 @@ def test_wrong_settings_of_a_camera_name_the_key(tmp_path: Path, table: str, fie
         (f'cameras: {{wrist: {{log: "{WRIST}", time_offset: soon}}}}', "cameras.wrist.time_offset"),
         (f'cameras: {{wrist: {{log: "{WRIST}", time_offset: .nan}}}}', "cameras.wrist.time_offset"),
         ("cameras: {wrist: {log: rig.yaml}}", "cameras.wrist.log"),
+        (f'cameras: {{a: {{log: "{WRIST}"}}, b: {{log: "{TABLE}"}}, b: {{log: "{TABLE}"}}}}', None),
         ("cameras: {wrist: {log: nowhere}}", "log"),
         ("cameras: " + "{" + ", ".join(f'c{k}: {{log: "{TABLE}"}}' for k in range(MAX_CAMERAS + 1)) + "}", "cameras"),
     ],
 )
-def test_a_wrong_file_names_the_key(tmp_path: Path, text: str, field: str) -> None:
+def test_a_wrong_file_names_the_key(tmp_path: Path, text: str, field: str | None) -> None:
     with pytest.raises(LogError) as caught:
         open_log(write(tmp_path, text))
     assert caught.value.field == field

@@ -148,10 +148,11 @@ def test_the_cameras_have_no_pose_before_the_map_begins_or_while_the_first_camer
 def test_a_loop_closure_moves_keyframes_gaussians_results_and_pose_of_a_fixed_camera_together() -> None:
     T = in_world(wrist(), table_pose())
     still = MappingConfig(refine_iterations=0)
-    slam = processed(CameraConfig(T_world_camera=pose_config(T)), table_frames()[:3], mapping=still)
+    slam = processed(estimated(T @ WRONG, fixed=True), table_frames()[:-1], mapping=still)
     mapper = slam._mapper
+    T = slam.trajectory_of("table").T_world_camera[-1]
     anchor = slam.further_cameras["table"].anchor
-    assert anchor is not None
+    assert anchor
     move = se3_exp(np.array([0.02, 0.01, 0.0, 0.0, 0.03, 0.0]))
     before = mapper.model.means[mapper.model.anchors == NUMBERS].numpy().astype(np.float64)
     first = {k.number: k.T_world_camera for k in mapper.first_keyframes}
@@ -165,7 +166,7 @@ def test_a_loop_closure_moves_keyframes_gaussians_results_and_pose_of_a_fixed_ca
     assert np.allclose(slam.trajectory_of("table").T_world_camera, move @ T)
     moved = {k.number: k.T_world_camera @ inverse(first[k.number]) for k in mapper.first_keyframes}
     assert np.allclose(moved[anchor], move)
-    frame = replace(table_frames()[3], index=99)
+    frame = replace(table_frames()[-1], index=99)
     found = slam.process(frame).T_world_camera
     assert found is not None
     assert np.allclose(found, move @ T)
@@ -189,3 +190,64 @@ def test_a_carried_camera_has_no_pose_where_the_motion_of_the_first_one_is_unkno
     assert slam.process(replace(side, stamp=wrist()[1].stamp + 0.01)).verdict == "ok"
     assert slam.process(replace(side, stamp=wrist()[1].stamp - 0.01)).verdict == "lost"  # older than the first camera
     assert slam.process(replace(side, stamp=wrist()[1].stamp + 0.5)).verdict == "lost"  # a gap
+
+
+def test_a_given_pose_stays_where_a_loop_closure_moves_other_keyframes() -> None:
+    T = in_world(wrist(), table_pose())
+    for camera in (CameraConfig(T_world_camera=pose_config(T)), estimated(T, fixed=True)):
+        slam = processed(camera, table_frames()[:3])
+        move = se3_exp(np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.0]))
+        poses = slam._mapper.loops.graph.poses
+        slam._mapper.loops.correction = {number: move if number else np.eye(4) for number in poses}
+        slam.close_loops()
+        found = slam.further_cameras["table"]
+        assert isinstance(found, MountedCamera)
+        assert np.allclose(found.pose.T_parent_camera, T, atol=1e-9)
+        assert np.allclose(slam.trajectory_of("table").T_world_camera, T, atol=1e-9)
+
+
+def test_a_pose_of_a_free_camera_moves_with_the_keyframe_that_views_the_same_place() -> None:
+    poses = [wrist().ground_truth.T_world_camera[0]] * FRAMES  # it stays at the first keyframe
+    slam = processed(CameraConfig(), frames_of(wrist(), poses, wrist().stamps, "head", width=240), "head")
+    camera = slam.further_cameras["head"]
+    assert camera.anchor == 0
+    before = slam.trajectory_of("head").T_world_camera
+    move = se3_exp(np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    numbers = slam._mapper.loops.graph.poses
+    slam._mapper.loops.correction = {number: move if number else np.eye(4) for number in numbers}
+    slam.close_loops()
+    assert np.allclose(slam.trajectory_of("head").T_world_camera, before, atol=1e-9)
+
+
+def test_a_free_camera_that_sees_another_side_is_never_found_though_it_stands_still() -> None:
+    for degrees in (120, 150, 180, 210):
+        T = side_view(wrist(), np.radians(degrees), 0.0)
+        frames = frames_of(wrist(), [T] * FRAMES, wrist().stamps, "head", width=240)
+        slam = processed(CameraConfig(), frames, "head")
+        found = slam.trajectory_of("head").T_world_camera
+        truth = in_world(wrist(), T)
+        assert all(pose_distance(truth, pose)[0] < 0.02 for pose in found), degrees
+        assert all(pose_distance(truth, k.T_world_camera)[0] < 0.02 for k in slam.keyframes if k.camera_name)
+
+
+@pytest.mark.parametrize("exact", [False, True])
+def test_a_camera_that_was_bumped_is_noticed_and_estimated_again_unless_its_pose_is_exact(exact: bool) -> None:
+    log = wrist_log(70, width=160, height=120)
+    bump = se3_exp(np.array([0.04, 0.02, 0.02, 0.0, 0.03, 0.0]))
+    poses = [table_pose() if k < 15 else table_pose() @ bump for k in range(70)]
+    frames = frames_of(log, poses, [k / 30 + 0.01 for k in range(70)], "table", width=200, height=120)
+    T = in_world(log, table_pose())
+    given = CameraConfig(T_world_camera=pose_config(T)) if exact else estimated(T, fixed=True)
+    slam = Slam(Config(cameras={"table": given}))
+    for frame in in_order(log, frames):
+        slam.process(frame)
+    camera = slam.further_cameras["table"]
+    assert isinstance(camera, MountedCamera)
+    last = [r for r in slam.results if r.camera_name][-1]
+    if exact:
+        assert last.verdict == "lost"
+        assert "from its pose" in last.reasons[0]
+    else:
+        assert camera.pose.known
+        assert pose_distance(T @ bump, camera.pose.T_parent_camera)[0] < 5e-3
+        assert last.verdict == "ok"

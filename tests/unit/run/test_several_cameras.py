@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from splatbot.config import Config
-from splatbot.errors import InputError
+from splatbot.errors import FormatError, InputError
 from splatbot.frame import Frame
 from splatbot.logs import Log, open_log
 from splatbot.logs.base import LogBase
@@ -23,6 +23,7 @@ from splatbot.run import map_log
 from splatbot.run.pacing import PacedSource
 from splatbot.run.state import SavedRun
 from splatbot.tracking.nearby_keyframes import pose_distance
+from splatbot.training.datasets.run import run_dataset
 from tests.rgbd import small_config
 from tests.several_cameras import WRONG, estimated, frames_of, in_world, side_view, wrist_log
 
@@ -107,6 +108,28 @@ def test_frames_are_scored_and_audited_at_the_pose_of_their_camera(whole: Path, 
     for key in ("ate_rmse_m", "psnr_holdout_db", "depth_median_m"):
         assert again[key] == pytest.approx(saved[key], rel=1e-6), key
     assert json.loads((whole / "audit.json").read_text())["points_confirmed"] > 0
+
+
+def test_every_camera_has_held_out_frames(whole: Path) -> None:
+    held_out = [row.camera_name for row in RunFolder(whole).load_frames() if row.held_out]
+    assert {name: held_out.count(name) for name in ("", "table", "head")} == {"": 2, "table": 2, "head": 2}
+
+
+def test_a_rig_that_has_changed_since_the_run_is_refused(whole: Path, rig: Path, tmp_path: Path) -> None:
+    cameras = yaml.safe_load(rig.read_text())["cameras"]
+    for name in ("wrist", "table", "head"):
+        cameras[name]["log"] = str(rig.parent / name)
+    for changed in ({**cameras, "head": {**cameras["head"], "time_offset": 0.1}}, {"w": cameras["wrist"]}):
+        (tmp_path / "rig.yaml").write_text(yaml.safe_dump({"cameras": changed}, sort_keys=False))
+        with pytest.raises(FormatError, match="frames"):
+            rescore(RunFolder(whole), open_log(tmp_path / "rig.yaml"))
+
+
+def test_frames_of_each_camera_are_trained_with_their_own_size(whole: Path, rig: Path) -> None:
+    data = run_dataset(whole, open_log(rig))
+    assert {(view.camera.width, view.camera.height) for view in data.views} == {(160, 120), (200, 120), (160, 180)}
+    for view in data.views:
+        assert view.read().shape == (view.camera.height, view.camera.width, 3)
 
 
 def test_observers_of_further_cameras_are_their_keyframes(whole: Path) -> None:
