@@ -12,8 +12,8 @@ After a header, a file is one LZMA stream:
   and its sign is the lowest bit;
 - the low bits of the turns, which are noise: the lowest bit of all of them, then the next one, and so on.
 
-Columns are: whether a Gaussian is the first of its leaf; the integers of :mod:`splatbot.formats.enclosing`; the logit
-of the opacity; luma, red - blue and green - magenta of the colour; observations, anchors and misses; uncertainty.
+Columns are whether a Gaussian is the first of its leaf, the integers of :mod:`splatbot.formats.enclosing`, and the
+logit of the opacity. Luma, red - blue and green - magenta of the colour follow, then the bookkeeping.
 """
 
 from __future__ import annotations
