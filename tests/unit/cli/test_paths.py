@@ -150,7 +150,12 @@ def test_a_file_is_recognized_by_its_suffix(tmp_path: Path, name: str, kind: str
 
 @pytest.mark.parametrize(
     ("name", "fix"),
-    [("a.ksplat", "superspl"), ("a.usdz", r"\.spz, \.sbz, \.sog, \.glb"), ("a.gltf", r"one \.glb"), ("a.obj", r"\.glb")],
+    [
+        ("a.ksplat", "superspl"),
+        ("a.usdz", r"\.spz, \.sbz, \.sog, \.glb"),
+        ("a.gltf", r"one \.glb"),
+        ("a.obj", r"\.glb"),
+    ],
 )
 def test_a_map_of_another_format_is_named_with_the_way_to_convert_it(tmp_path: Path, name: str, fix: str) -> None:
     (tmp_path / name).touch()
