@@ -85,8 +85,8 @@ class FurtherCamera(Protocol):
 class MountedCamera:
     """A camera at a constant pose: in the world, or on the first camera that carries it.
 
-    A known pose is checked every half second. Three frames in succession that are aligned elsewhere show that the camera
-    has moved; an estimated pose is then estimated again.
+    A known pose is checked every half second. Three frames in succession that are aligned elsewhere show that it has
+    changed; an estimated pose is then estimated again.
 
     Args:
         pose: its pose on the world or on the first camera.
