@@ -12,12 +12,29 @@ from splatbot.camera import Camera
 from splatbot.config import CameraConfig, PoseConfig
 from splatbot.frame import Frame
 from splatbot.geometry import inverse, look_at, rotation_to_quat, se3_exp
+from splatbot.logs.base import LogBase
 from splatbot.logs.synthetic import SyntheticLog
 
 Array = NDArray[np.float64]
 
 WRONG = se3_exp(np.array([0.014, -0.010, 0.010, 0.020, -0.022, 0.018]))
 """A wrong pose of a camera: 2 cm and 2 degrees."""
+
+
+class FramesLog(LogBase):
+    """Frames in memory as a log of one camera."""
+
+    name, uri, ground_truth = "frames", "frames", None
+
+    def __init__(self, frames: Sequence[Frame]) -> None:
+        self._frames = frames
+        self.camera = frames[0].camera
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def _decode(self, index: int) -> Frame:
+        return self._frames[index]
 
 
 def wrist_log(frames: int, *, width: int = 320, height: int = 240, effects: str = "") -> SyntheticLog:

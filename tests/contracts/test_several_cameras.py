@@ -22,7 +22,6 @@ from splatbot.config import CameraConfig
 from splatbot.errors import InputError
 from splatbot.frame import Frame
 from splatbot.geometry import inverse, look_at, pose_from_quat, rotation_to_quat, se3_exp
-from splatbot.logs.base import LogBase
 from splatbot.logs.record import record
 from splatbot.logs.synthetic import SyntheticLog
 from splatbot.robots.panda import panda
@@ -34,26 +33,20 @@ from splatbot.tracking.nearby_keyframes import pose_distance
 from splatbot.workspace import Workspace
 from tests.contracts.conftest import Service, running
 from tests.rgbd import small_config
-from tests.several_cameras import WRONG, estimated, frames_of, in_order, in_world, pose_config, side_view, wrist_log
+from tests.several_cameras import (
+    WRONG,
+    FramesLog,
+    estimated,
+    frames_of,
+    in_order,
+    in_world,
+    pose_config,
+    side_view,
+    wrist_log,
+)
 from tests.swept_arm import T_BASE_STATIC_CAMERA, near_the_sweep, static_log
 
 FRAMES = 14
-
-
-class FramesLog(LogBase):
-    """Frames in memory as a log of one camera."""
-
-    name, uri, ground_truth = "frames", "frames", None
-
-    def __init__(self, frames: list[Frame]) -> None:
-        self._frames = [replace(frame, camera_name="") for frame in frames]
-        self.camera = frames[0].camera
-
-    def __len__(self) -> int:
-        return len(self._frames)
-
-    def _decode(self, index: int) -> Frame:
-        return self._frames[index]
 
 
 @pytest.fixture(scope="module")

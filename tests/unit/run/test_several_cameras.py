@@ -13,7 +13,6 @@ from splatbot.config import Config
 from splatbot.errors import FormatError, InputError
 from splatbot.frame import Frame
 from splatbot.logs import Log, open_log
-from splatbot.logs.base import LogBase
 from splatbot.logs.record import record
 from splatbot.results.folder import RunFolder
 from splatbot.results.observers import observers
@@ -25,25 +24,9 @@ from splatbot.run.state import SavedRun
 from splatbot.tracking.nearby_keyframes import pose_distance
 from splatbot.training.datasets.run import run_dataset
 from tests.rgbd import small_config
-from tests.several_cameras import WRONG, estimated, frames_of, in_world, side_view, wrist_log
+from tests.several_cameras import WRONG, FramesLog, estimated, frames_of, in_world, side_view, wrist_log
 
 FRAMES = 14
-
-
-class Recorded(LogBase):
-    """Frames in memory as a log."""
-
-    name, uri, ground_truth = "frames", "frames", None
-
-    def __init__(self, frames: list[Frame]) -> None:
-        self._frames = frames
-        self.camera = frames[0].camera
-
-    def __len__(self) -> int:
-        return len(self._frames)
-
-    def _decode(self, index: int) -> Frame:
-        return self._frames[index]
 
 
 @pytest.fixture(scope="module")
@@ -54,8 +37,8 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Path:
     record(wrist, folder / "wrist", ground_truth=wrist.ground_truth)
     T = side_view(wrist, np.radians(30), 0.1)
     stamps = [k / 30 + 0.01 for k in range(FRAMES)]
-    record(Recorded(frames_of(wrist, [T] * FRAMES, stamps, "", width=200, height=120)), folder / "table")
-    record(Recorded(frames_of(wrist, [*wrist.ground_truth.T_world_camera], stamps, "", width=160)), folder / "head")
+    record(FramesLog(frames_of(wrist, [T] * FRAMES, stamps, "", width=200, height=120)), folder / "table")
+    record(FramesLog(frames_of(wrist, [*wrist.ground_truth.T_world_camera], stamps, "", width=160)), folder / "head")
     table = estimated(in_world(wrist, T) @ WRONG, fixed=True).model_dump(mode="json", exclude_unset=True)
     cameras = {"wrist": {"log": "wrist"}, "table": {"log": "table", **table}, "head": {"log": "head"}}
     (folder / "rig.yaml").write_text(yaml.safe_dump({"cameras": cameras}, sort_keys=False))
@@ -191,7 +174,7 @@ def test_in_real_time_a_frame_is_dropped_for_a_newer_one_of_its_own_camera_alone
         Frame(0.0, f.rgb, f.depth, f.camera, index, camera_name=name)
         for index, (f, name) in enumerate([(wrist[0], ""), (wrist[1], "table"), (wrist[2], "")])
     ]
-    log: Log = Recorded(frames)
+    log: Log = FramesLog(frames)
     source = PacedSource(log, 3, rate=None)
     delivered = [arrival.index for arrival in source]
     assert delivered == [1, 2]
