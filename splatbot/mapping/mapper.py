@@ -445,9 +445,8 @@ class Mapper:
 
     def _compare_latest(self) -> None:
         with self._lock:
-            names = [*self._latest][:1]
-            observations = [self._latest.pop(name) for name in names]
-        for observation in observations:
+            observation = self._latest.pop(next(iter(self._latest))) if self._latest else None
+        if observation is not None:
             self._compare(observation)
 
     def _compare(self, observation: Observation) -> None:
