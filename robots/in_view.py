@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 import sys
-from functools import cached_property
+from collections.abc import Iterator, Mapping
+from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Protocol, TypeGuard, runtime_checkable
 
 from numpy.typing import ArrayLike
 
@@ -14,7 +15,8 @@ from splatbot.errors import FormatError, InputError, LogError
 from splatbot.frame import Frame
 from splatbot.layouts import log_kind
 from splatbot.logs import Log, open_log
-from splatbot.logs.rig import RigLog
+from splatbot.logs.rig import RigCamera, RigLog
+from splatbot.logs.ros_transforms import StampedTransform
 from splatbot.mapping.selfmask import JointsUnknownError, SelfMask
 from splatbot.protocols import RobotKinematics
 from splatbot.results.folder import RunFolder
@@ -24,9 +26,6 @@ from splatbot.robots.store import load_robot
 from splatbot.robots.tf_buffer import TransformBuffer
 from splatbot.run.masked import MaskedLog
 from splatbot.workspace import NAME, Workspace, find_workspace
-
-if TYPE_CHECKING:
-    from splatbot.logs.bag import BagLog
 
 MAX_RECORDED = 5_000_000
 """Largest number of transforms of a recording: 320 MB, ten minutes of eight links at 1 kHz."""
@@ -89,49 +88,84 @@ def open_without_robot(uri: str, robot: str | None, *, camera: str | None = None
         return RigLog(uri, lambda address, own: open_without_robot(address, robot, camera=own))
     model, workspace, file = load_robot(robot), find_workspace(uri) or Workspace(), f"{uri}/{NAME}"
     log = open_log(uri, camera=camera, joint_delay=workspace.joint_delay)
-    if log_kind(uri) == "bag":
-        from splatbot.logs.bag import BagLog  # rosbags builds its message classes when imported
-
-        if isinstance(log, BagLog) and log.has_transforms:
-            return MaskedLog(log, RecordedMask(model, workspace, log))
-    return MaskedLog(log, self_mask(model, workspace, file=file))
+    links = recorded_links(model, {"": workspace}, log).get("")
+    mask = self_mask(model, workspace, file=file, needs_camera=links is None)
+    return MaskedLog(log, mask if links is None else partial(links.mask, mask))
 
 
-class RecordedMask:
-    """Masks the robot in the frames of a recording of ROS topics.
+@runtime_checkable
+class LogWithTransforms(Protocol):
+    """The part that masks use of a recording of ROS topics, :class:`splatbot.logs.bag.BagLog`."""
+
+    path: Path
+
+    @property
+    def has_transforms(self) -> bool:
+        """Return whether the recording has messages of TF."""
+        ...
+
+    def transforms(self) -> Iterator[StampedTransform]:
+        """Yield the transforms of /tf_static, then those of /tf."""
+        ...
+
+
+def has_tf(log: Log) -> TypeGuard[LogWithTransforms]:
+    """Return whether a log is a recording with messages of TF."""
+    return isinstance(log, LogWithTransforms) and log.has_transforms
+
+
+def recorded_links(robot: RobotModel, workspaces: Mapping[str, Workspace], log: Log) -> dict[str, RecordedLinks]:
+    """Return the links of a robot in the TF of recordings, by the names of the cameras whose recordings have TF.
+
+    Args:
+        robot: the robot.
+        workspaces: scenes by the names of cameras; that of the first one is empty.
+        log: a recording, or a rig of several ones.
+    """
+    parts = log.parts if isinstance(log, RigLog) else [RigCamera("", log, 0.0)]
+    found = {}
+    for name, part in zip(("", *log.cameras), parts, strict=True):
+        if has_tf(part.log):
+            workspace = workspaces.get(name, Workspace())
+            found[name] = RecordedLinks(robot, workspace, part.log, time_offset=part.time_offset)
+    return found
+
+
+class RecordedLinks:
+    """Masks the robot in the frames of a recording of ROS topics with TF.
 
     Its joint states at the time of a frame count first. Where they are missing, TF gives the poses of the links at the
     times of colour and depth. It always does if the pose of the camera on its link is not known.
 
     Args:
         robot: the robot.
-        workspace: pose of the camera on its link, if known, names of joints and prefix in TF.
+        workspace: delay of the joints, and prefix in TF.
         log: the recording.
-
-    Raises:
-        InputError: the workspace does not fit the robot.
+        time_offset: time [s] that was added to the stamps of the frames.
     """
 
-    def __init__(self, robot: RobotModel, workspace: Workspace, log: BagLog) -> None:
+    def __init__(
+        self, robot: RobotModel, workspace: Workspace, log: LogWithTransforms, *, time_offset: float = 0.0
+    ) -> None:
         self._robot, self._workspace, self._log = robot, workspace, log
-        self._mask = self_mask(robot, workspace, needs_camera=False)
+        self._after = workspace.joint_delay - time_offset
 
-    def __call__(self, frame: Frame) -> Frame:
+    def mask(self, mask: SelfMask, frame: Frame) -> Frame:
         """Return the frame with the robot removed from its mask.
 
         Raises:
             JointsUnknownError: neither joint states nor TF give the poses of the links at its time.
             LogError: the recording has too many transforms.
         """
-        if self._mask.has_camera:
+        if mask.has_camera:
             try:
-                return self._mask(frame)
+                return mask(frame)
             except JointsUnknownError:
                 if not self._link_poses:
                     raise
         masked = frame
-        for after in {0.0, frame.depth_delay}:
-            masked = self._link_poses.mask(self._mask, masked, frame.stamp + after + self._workspace.joint_delay)
+        for later in {0.0, frame.depth_delay}:
+            masked = self._link_poses.mask(mask, masked, frame.stamp + later + self._after)
         return masked
 
     @cached_property

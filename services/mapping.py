@@ -11,6 +11,7 @@ from splatbot.config import Config
 from splatbot.errors import InputError, LogError, MapNotFoundError
 from splatbot.logs import Log, open_log
 from splatbot.logs.rig import RigLog
+from splatbot.robots.in_view import has_tf
 from splatbot.services.jobs import JobCancelled, JobHandle, Work
 from splatbot.services.live import LiveMapping
 from splatbot.services.problems import disk_error
@@ -102,7 +103,7 @@ def open_rig(uri: str) -> tuple[Log, dict[str, Workspace]]:
     """Open the recordings of several cameras, each with the joints of its own ``scene.yaml``.
 
     Returns:
-        The log, and the workspaces of its cameras by name: of further ones those with a mount on the robot.
+        The log, and the workspaces of its cameras by name: of further ones those with a mount on the robot, or with TF.
 
     Raises:
         LogError: the log is damaged.
@@ -115,8 +116,10 @@ def open_rig(uri: str) -> tuple[Log, dict[str, Workspace]]:
         return open_log(address, camera=camera, joint_delay=found[-1].joint_delay)
 
     log = RigLog(uri, open_one)
-    by_name = zip(("", *log.cameras), found, strict=True)
-    return log, {name: one for name, one in by_name if not name or one.T_link_camera is not None}
+    by_name = zip(("", *log.cameras), found, log.parts, strict=True)
+    return log, {
+        name: one for name, one, part in by_name if not name or one.T_link_camera is not None or has_tf(part.log)
+    }
 
 
 def _map(

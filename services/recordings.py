@@ -21,6 +21,7 @@ _SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".txt", ".json", ".yaml"})
 _MAX_FILES = 200_000
 _CHUNK = 1 << 20
 _IMAGES = (".png", ".jpg", ".jpeg")
+_BAGS = (".mcap", ".bag")  # files of recordings of ROS topics
 _LISTS = ("rgb.txt", "depth.txt", "mask.txt")
 _SAMPLES_A_FRAME = 4  # lines of joints and ground truth, which robots report more often than images
 _MAX_URI = 4095
@@ -30,7 +31,9 @@ _MAX_DOCUMENT = 1 << 20  # bytes of a JSON or YAML file
 
 
 def allowed_log(uri: str, roots: Sequence[str], *, camera: str | None = None, max_frames: int, max_pixels: int) -> str:
-    """Return the address of the log that a client names: synthetic, or a folder under one of ``roots``, links resolved.
+    """Return the address of the log that a client names: synthetic, or under one of ``roots``, links resolved.
+
+    Under a root it is a folder, or the file of a recording of ROS topics.
 
     Raises:
         InputError: it is elsewhere, whether or not there is something.
@@ -52,10 +55,14 @@ def allowed_log(uri: str, roots: Sequence[str], *, camera: str | None = None, ma
         return uri
     if "\x00" not in uri and len(uri) <= _MAX_URI:
         for root in (Path(root).resolve() for root in roots):
-            folder = (root / uri).resolve()  # an absolute uri is used as it is
-            if folder.is_relative_to(root) and folder.is_dir():
-                stays_inside(folder)
-                return str(folder)
+            place = (root / uri).resolve()  # an absolute uri is used as it is
+            if not place.is_relative_to(root):
+                continue
+            if place.is_dir():
+                stays_inside(place)
+                return str(place)
+            if place.is_file() and place.suffix.lower() in _BAGS:
+                return str(place)
     hint = "name a recording under one of the service's log roots (SPLATBOT_LOG_ROOTS), or synthetic:SCENE"
     raise InputError("is no recording that may be mapped.", field="log", hint=hint)
 

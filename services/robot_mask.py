@@ -15,10 +15,11 @@ from numpy.typing import ArrayLike, NDArray
 from splatbot.errors import InputError
 from splatbot.frame import Frame
 from splatbot.geometry import inverse, transform_points
+from splatbot.logs import Log
 from splatbot.logs.joints import MAX_GAP, interpolate_joints, select_joints
 from splatbot.mapping.selfmask import JointsUnknownError, SelfMask
 from splatbot.protocols import Array, FrameSource
-from splatbot.robots.in_view import self_mask
+from splatbot.robots.in_view import recorded_links, self_mask
 from splatbot.robots.link_poses import LinkPoses
 from splatbot.robots.robot import RobotModel
 from splatbot.robots.tf_buffer import TransformBuffer
@@ -133,11 +134,15 @@ class RobotMask:
     that time. So is the pose of the camera if it is not known on its link; then TF counts alone. A frame without known
     joints or poses is refused: it must not be mapped. So is a frame of a further camera without a workspace of its own.
 
+    Frames of a recording are masked as `splatbot map --robot` does it: by their own joints, else by the recorded TF.
+
     Args:
         robot: the robot.
         workspace: pose of the camera on its link, and names, offsets and delay of the joints.
-        topics: transforms and attached objects; those of a recording are not of its frames.
+        topics: transforms and attached objects; those of clients are not of the frames of a recording.
         camera_in_tf: the pose of the camera may be missing in the workspace.
+        log: the recording whose frames are masked, if they are not live. Where it has TF, the pose of the camera may be
+            missing, too.
         further: workspaces of further cameras by name, each with the pose of its camera on a link.
 
     Raises:
@@ -152,9 +157,12 @@ class RobotMask:
         *,
         camera_in_tf: bool = False,
         further: Mapping[str, Workspace] | None = None,
+        log: Log | None = None,
     ) -> None:
-        self.robot, self._workspace, self._camera_in_tf = robot, workspace or Workspace(), camera_in_tf
+        self.robot, self._workspace = robot, workspace or Workspace()
         self._workspaces = {"": self._workspace, **(further or {})}
+        self._recorded = {} if log is None else recorded_links(robot, self._workspaces, log)
+        self._in_tf = {*self._recorded, *([""] if camera_in_tf else [])}
         self._topics = topics
         transforms = TransformBuffer() if topics is None else topics.transforms
         self._link_poses = LinkPoses(robot, transforms, self._workspace.tf_prefix)
@@ -188,7 +196,10 @@ class RobotMask:
         try:
             if live:
                 self._hold_attached()
-            if live and frame.joints is None:
+            links = self._recorded.get(frame.camera_name)
+            if links is not None:
+                masked = links.mask(self._mask_of(frame), frame)
+            elif live and frame.joints is None:
                 masked = self._masked_at(frame, 0.0)
                 if abs(frame.depth_delay) > _SAME_TIME_S:
                     masked = self._masked_at(masked, frame.depth_delay)
@@ -250,7 +261,7 @@ class RobotMask:
     def _build(self) -> None:
         held = np.concatenate([self._given, self._attached])
         self._masks = {
-            name: self_mask(self.robot, workspace, held=held, needs_camera=bool(name) or not self._camera_in_tf)
+            name: self_mask(self.robot, workspace, held=held, needs_camera=name not in self._in_tf)
             for name, workspace in self._workspaces.items()
         }
 
@@ -305,7 +316,7 @@ class RobotMask:
 class MaskedSource:
     """The frames of a log or a camera with the robot masked; frames that the mask refuses are left out.
 
-    Frames of a log are masked by their own joints alone.
+    Frames of a log are masked by their own joints, or by the TF of the log, alone.
 
     Args:
         source: the frames.

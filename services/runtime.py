@@ -14,6 +14,7 @@ from typing import Any
 from splatbot.config import Config
 from splatbot.errors import ConfigError, InputError, MapNotFoundError, SplatbotError
 from splatbot.frame import Frame
+from splatbot.logs import Log
 from splatbot.protocols import FrameSource
 from splatbot.rasterize.native import native
 from splatbot.robots.robot import RobotModel
@@ -199,17 +200,26 @@ class Runtime:
             raise InputError(f"map {map_id!r} masks no robot.", field="map", hint=hint)
         self.stream(map_id).push(frame)
 
-    def new_mask(self, workspace: Workspace | None, further: Mapping[str, Workspace] | None = None) -> RobotMask | None:
+    def new_mask(
+        self,
+        workspace: Workspace | None,
+        further: Mapping[str, Workspace] | None = None,
+        *,
+        log: Log | None = None,
+    ) -> RobotMask | None:
         """Return a mask of the settings' robot for the camera of a workspace; None without such a robot.
 
         Args:
             workspace: of the first camera.
             further: of further cameras by name.
+            log: the recording whose frames are masked, if they are not live.
 
         Raises:
             InputError: the pose of a camera is unknown, or a workspace does not fit the robot.
         """
-        return None if self.robot is None else RobotMask(self.robot, workspace, self._robot_topics, further=further)
+        if self.robot is None:
+            return None
+        return RobotMask(self.robot, workspace, self._robot_topics, further=further, log=log)
 
     def mask_of_stream(
         self,

@@ -100,13 +100,13 @@ class MapList(BaseModel):
 
 
 class RobotInView(Request):
-    """The robot in the camera's view. Its pixels are masked, and a frame without its joints is not mapped."""
+    """The robot in the camera's view. Its pixels are masked; a frame without its joints or TF is not mapped."""
 
     name: str = Field(description="robot, as `splatbot robot list` names it")
     T_link_camera: Pose | None = Field(
         None,
         description="pose of the camera on its link; values left out are those of the recording's scene.yaml. In the "
-        "map `ros`, of frames of ROS topics, it may be left out if TF has it",
+        "map `ros`, and in recordings of ROS topics, it may be left out if TF has it",
     )
     camera_link: int = Field(-1, description="index of the link that carries the camera; -1: the last, 0: the base")
     joint_offsets: list[float] | None = Field(
@@ -224,7 +224,9 @@ class MapRequest(Request):
     """A map to be made: of a recording, or, without ``log``, of frames that will be pushed."""
 
     id: str = Field(description="its name in URLs: a-z, 0-9, - and _")
-    log: str | None = Field(None, description="synthetic:SCENE?..., or a folder under one of the service's log roots")
+    log: str | None = Field(
+        None, description="synthetic:SCENE?..., or a folder, .mcap or .bag under one of the service's log roots"
+    )
     camera: str | None = Field(None, description="preset of intrinsics (tum_fr1, ...) instead of the log's own")
     max_frames: Annotated[int, Field(ge=1)] | None = Field(None, description="read no more than these")
     robot_base: Pose | None = Field(None, description="T_world_base, for questions about the arm")

@@ -19,7 +19,7 @@ from starlette.responses import FileResponse
 from splatbot.config import Config, with_cameras
 from splatbot.errors import InputError, MapNotFoundError
 from splatbot.formats import WRITTEN, save_gaussians
-from splatbot.logs import open_log
+from splatbot.logs import Log, open_log
 from splatbot.services.arms import known_robot
 from splatbot.services.codecs import ZIP, answer, answers, body_of, request_body
 from splatbot.services.dependencies import (
@@ -126,7 +126,7 @@ def create_map(
     check_id(query.id)
     base = query.robot_base.matrix("robot_base") if query.robot_base is not None else None
     if query.log is None:
-        mask, config = _mask(service, query, None), _with_cameras(service.config, query)
+        mask, config = _mask_of_stream(service, query), _with_cameras(service.config, query)
         served = service.open_stream(query.id, workspace=workspace_of("synthetic:", base), mask=mask, config=config)
         place = {"Location": f"/v1/maps/{query.id}"}
         return Response(_info(served).model_dump_json(), 201, place, media_type="application/json")
@@ -140,8 +140,7 @@ def create_map(
     uri = allowed_log(
         query.log, limits.log_roots, camera=query.camera, max_frames=limits.max_frames, max_pixels=limits.max_pixels
     )
-    mask = _mask(service, query, uri)
-    log = open_log(uri, camera=query.camera, joint_delay=0.0 if mask is None else mask.joint_delay)
+    log, mask = _open_masked(query, uri)
     total = check_length(log, limits.max_frames, query.max_frames)
     workspace = workspace_of(uri, base)
     served = service.store.add(
@@ -318,8 +317,17 @@ def _masked(mask: RobotMask) -> RobotMaskInfo:
     return RobotMaskInfo(name=mask.robot.name, masked=mask.masked, refused=mask.refused, problem=mask.problem)
 
 
-def _mask(service: Service, query: MapRequest, uri: str | None) -> RobotMask | None:
-    """Return the mask of a robot in view of the cameras, which the request or the recording's scene.yaml describes."""
+def _open_masked(query: MapRequest, uri: str) -> tuple[Log, RobotMask | None]:
+    """Open a recording, with the mask of the robot that the request and the recording's scene.yaml describe."""
+    if query.robot is None:
+        return open_log(uri, camera=query.camera), None
+    workspace = query.robot.workspace(None if uri.startswith("synthetic:") else find_workspace(uri))
+    log = open_log(uri, camera=query.camera, joint_delay=workspace.joint_delay)
+    return log, RobotMask(known_robot(query.robot.name), workspace, log=log)
+
+
+def _mask_of_stream(service: Service, query: MapRequest) -> RobotMask | None:
+    """Return the mask of a robot in view of the cameras of pushed frames, which the request describes."""
     robot, cameras = query.robot, query.cameras or {}
     mounts = {name: camera.robot for name, camera in cameras.items() if camera.robot is not None}
     if robot is None:
@@ -327,10 +335,7 @@ def _mask(service: Service, query: MapRequest, uri: str | None) -> RobotMask | N
             field = f"cameras.{next(iter(mounts))}.robot"
             raise InputError("needs the robot of the map.", field=field, hint="give robot, with its name")
         return None
-    known = None if uri is None or uri.startswith("synthetic:") else find_workspace(uri)
-    workspace = robot.workspace(known)
-    if uri is not None:
-        return RobotMask(known_robot(robot.name), workspace)
+    workspace = robot.workspace(None)
     further = {name: mount.workspace(workspace) for name, mount in mounts.items()}
     return service.mask_of_stream(query.id, known_robot(robot.name), workspace, further)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -15,8 +14,6 @@ from splatbot.errors import InputError
 from splatbot.layouts import REPLAY, is_camera, log_kind, map_file
 
 if TYPE_CHECKING:
-    from splatbot.logs import Log
-    from splatbot.protocols import FrameSource
     from splatbot.robots.controllers.ros import RosController
     from splatbot.robots.controllers.ur import UrController
     from splatbot.services.runtime import Runtime
@@ -72,8 +69,8 @@ def serve(
         ros_port: additional port for roslib clients that need a separate one (usually 9090). rosbridge is always at
             /rosbridge of --port, Foxglove at /foxglove.
         viewer_port: show the map in the browser at this port, on this machine alone. The page needs a key.
-        robot: mask this robot in the frames of --log, of a camera and of ROS topics, or SPLATBOT_ROBOT. A frame without
-            joint states at its time is not mapped.
+        robot: mask this robot in the frames of --log, of a camera and of ROS topics, or SPLATBOT_ROBOT. A frame
+            without joint states or TF at its time is not mapped.
         scene: scene.yaml with T_link_camera, the camera on the robot's link, and joint_delay; by default that of the
             log's folder.
         arm: an arm on the network, the arm "real" of the service; --robot is its model (docs/guide/arms.md).
@@ -102,8 +99,6 @@ def serve(
     check_output(record, "--record", folder=False)
 
     from splatbot.config import load_config
-    from splatbot.logs import open_log
-    from splatbot.robots.cameras import open_camera
     from splatbot.services.requests import configure_logging
     from splatbot.services.runtime import Runtime, check_exposure
     from splatbot.services.server import run_service
@@ -128,11 +123,11 @@ def serve(
         if map is not None:
             _add_map(runtime, map)
         elif device is not None:
-            _follow(runtime, device.removeprefix(REPLAY), lambda delay: open_camera(device, joint_delay=delay))
+            _follow_camera(runtime, device)
         elif log is not None and log_kind(log) == "rig":
             _follow_rig(runtime, log, camera)
         elif log is not None:
-            _follow(runtime, log, lambda delay: open_log(log, camera=camera, joint_delay=delay))
+            _follow_log(runtime, log, camera)
         run_service(runtime, on_start=partial(_announce, settings))
     finally:
         try:
@@ -177,14 +172,29 @@ def _add_map(runtime: Runtime, map_: Path) -> None:
     )
 
 
-def _follow(runtime: Runtime, log: str, open_source: Callable[[float], Log | FrameSource]) -> None:
-    """Map a log or a camera, opened with the delay of its joints; the scene is that of the settings or of the log."""
+def _follow_camera(runtime: Runtime, device: str) -> None:
+    """Map a camera, opened with the delay of its joints; the scene is that of the settings or of the replayed log."""
+    from splatbot.robots.cameras import open_camera
+    from splatbot.services.mapping import workspace_of
+    from splatbot.slam import Slam
+
+    workspace = runtime.workspace or workspace_of(device.removeprefix(REPLAY), None)
+    mask = runtime.new_mask(workspace)
+    source = open_camera(device, joint_delay=0.0 if mask is None else mask.joint_delay)
+    served = runtime.store.add(MAP_ID, source=source.name, state="mapping", workspace=workspace, mask=mask)
+    runtime.follow(served, source, Slam(runtime.config))
+
+
+def _follow_log(runtime: Runtime, log: str, camera: str | None) -> None:
+    """Map a log, opened with the delay of its joints; the scene is that of the settings or of the log."""
+    from splatbot.logs import open_log
     from splatbot.services.mapping import workspace_of
     from splatbot.slam import Slam
 
     workspace = runtime.workspace or workspace_of(log, None)
-    mask = runtime.new_mask(workspace)
-    source = open_source(0.0 if mask is None else mask.joint_delay)
+    delay = 0.0 if runtime.robot is None or workspace is None else workspace.joint_delay
+    source = open_log(log, camera=camera, joint_delay=delay)
+    mask = runtime.new_mask(workspace, log=source)
     served = runtime.store.add(MAP_ID, source=source.name, state="mapping", workspace=workspace, mask=mask)
     runtime.follow(served, source, Slam(runtime.config))
 
@@ -205,7 +215,7 @@ def _follow_rig(runtime: Runtime, log: str, camera: str | None) -> None:
     source, further = open_rig(log)
     first = further.pop("")
     workspace = runtime.workspace or first
-    mask = runtime.new_mask(workspace, further)
+    mask = runtime.new_mask(workspace, further, log=source)
     served = runtime.store.add(MAP_ID, source=source.name, state="mapping", workspace=workspace, mask=mask)
     runtime.follow(served, source, Slam(with_cameras(runtime.config, source.cameras, file=log)))
 

@@ -7,6 +7,7 @@ import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from websockets.sync.client import connect
 from websockets.sync.connection import Connection
 
+from splatbot.cli.serve import _follow_log
 from splatbot.client import Client, ServiceError
 from splatbot.frame import Frame
 from splatbot.geometry import inverse, rotation_to_quat
@@ -24,6 +26,7 @@ from splatbot.robots.panda import panda
 from splatbot.services.settings import ServiceSettings
 from splatbot.sim.wrist import WristLog
 from tests.contracts.conftest import Service, running
+from tests.ros_recording import record_ros
 from tests.swept_arm import T_BASE_STATIC_CAMERA, near_the_sweep, static_log, sweep
 from tests.waiting import until
 
@@ -131,6 +134,25 @@ def check_tf(seconds: float) -> None:
 
 def test_the_arm_stays_out_of_a_map_where_only_tf_is_published() -> None:
     check_tf(2.0)
+
+
+def test_the_arm_stays_out_of_a_recording_with_tf_alone_that_a_client_or_the_command_names(tmp_path: Path) -> None:
+    log = static_log(1.4)
+    bag = record_ros(tmp_path / "tf", log)
+    record_ros(tmp_path / "short", log, tf_until=0.9)
+    with running(ServiceSettings(port=0, robot="panda", log_roots=(str(tmp_path),))) as service:
+        client = Client(service.url, key=service.key)
+        _follow_log(service.runtime, str(bag), None)
+        for name in ("tf", "short"):
+            client.wait(client.create_map(name, name, robot={"name": "panda"})["id"])
+        until(lambda: client.map("default")["state"] == "ended")
+        for name, masked in (("default", 7), ("tf", 7), ("short", 5)):
+            model = service.store.get(name).ready.model
+            assert len(model) > 500
+            assert near_the_sweep(model.means.numpy(), T_BASE_STATIC_CAMERA, log.joints) == 0
+            described = client.map(name)["robot"]
+            assert (described["masked"], described["refused"]) == (masked, len(log) - masked)
+        assert "missing or stale" in client.map("short")["robot"]["problem"]
 
 
 def test_without_the_mask_the_same_frames_put_the_arm_into_the_map() -> None:
