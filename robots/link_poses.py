@@ -52,7 +52,7 @@ class LinkPoses:
 
     def _named(self) -> LinkFrames:
         if self.frames is None:
-            hint = "add it again: splatbot robot add FILE.urdf --overwrite, or publish its joint states"
+            hint = "add its URDF or MJCF again: splatbot robot add FILE --overwrite, or publish its joint states"
             problem = f"TF cannot mask {self._robot.name}: its stored file does not name its links."
             raise JointsUnknownError(problem, field="tf", hint=hint)
         return self.frames

@@ -13,6 +13,7 @@ from splatbot.errors import FormatError, InputError
 from splatbot.geometry import inverse, transform_points
 from splatbot.protocols import Array
 from splatbot.robots.joints import Joint
+from splatbot.robots.link_frames import LinkFrames
 from splatbot.robots.maker_meshes import as_shapes
 from splatbot.robots.reading import CONSTANTS, NamedShape, Reading, checked_slack, default_tip, distinct, joint, z_to
 from splatbot.robots.robot import Inertial, RobotModel
@@ -27,7 +28,7 @@ def read_mjcf(path: str | Path, *, tip: str | None = None, slack: float | None =
 
     The base is the body that carries the first moving joint's body. Bodies without a joint belong to the link that
     carries them, and moving joints outside the arm stay at the model's reference posture. All geoms are shapes of
-    their links, visual ones too. The keyframe "home" is the home posture.
+    their links, visual ones too. The keyframe "home" is the home posture. The names of bodies are those of links in TF.
 
     Args:
         path: MJCF file.
@@ -59,7 +60,8 @@ class _MjcfReader:
         if not numbers:
             raise FormatError("has no moving joint.", file=self.file, field=self._name(end), hint="name another --tip")
         first = int(self.model.jnt_bodyid[numbers[0]])
-        T_world_base = self._pose(int(self.model.body_parentid[first]))
+        bodies = [int(self.model.body_parentid[first]), *(int(self.model.jnt_bodyid[j]) for j in numbers)]
+        T_world_base = self._pose(bodies[0])
         # The frame of link k at the reference posture: origin at the anchor of its joint, z along the axis.
         frames = [T_world_base, *(self._joint_frame(j) for j in numbers)]
         before = [inverse(a) @ b for a, b in itertools.pairwise(frames)]
@@ -77,9 +79,19 @@ class _MjcfReader:
             home=self._home(numbers, joints),
             inertials=self._inertials(link_of, T_link_world),
             slack=slack,
+            link_frames=self._link_frames(bodies, frames),
         )
         self.notes.append(f"MJCF has no limits of velocity: {CONSTANTS.velocity:g} per second is assumed")
         return Reading(robot, tuple(self.notes))
+
+    def _link_frames(self, bodies: list[int], frames: list[Array]) -> LinkFrames | None:
+        """Return the places of the links (J + 1, 4, 4) [m] in their bodies; None if bodies do not name each link."""
+        names = tuple(str(self.model.body(body).name) for body in bodies)
+        if not all(names) or len(set(names)) < len(names):
+            self.notes.append("TF cannot mask the robot: a body of the arm has no name, or two joints")
+            return None
+        placed = [inverse(self._pose(body)) @ T for body, T in zip(bodies, frames, strict=True)]
+        return LinkFrames(names, np.stack(placed))
 
     def _end(self, tip: str | None) -> tuple[int, Array]:
         """Return the last body of the arm, and the pose T_world_tcp (4, 4) [m]."""

@@ -286,7 +286,7 @@ def _gripper_text(model: RobotModel) -> str:
 
 def _links_text(model: RobotModel) -> str:
     frames = model.link_frames
-    return "no names: add its URDF again" if frames is None else ", ".join(frames.names)
+    return "no names: add its URDF or MJCF again" if frames is None else ", ".join(frames.names)
 
 
 def _tool_text(model: RobotModel) -> str:

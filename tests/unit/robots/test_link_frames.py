@@ -7,6 +7,7 @@ import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -16,6 +17,7 @@ from splatbot.protocols import Array
 from splatbot.robots.arms import ARMS, description_of
 from splatbot.robots.link_frames import LinkFrames
 from splatbot.robots.maker_meshes import Source
+from splatbot.robots.mjcf_reader import read_mjcf
 from splatbot.robots.panda import panda
 from splatbot.robots.store import load_robot, read_robot, robot_names, save_robot
 from splatbot.robots.urdf import read_urdf
@@ -136,6 +138,50 @@ def test_an_added_robot_keeps_the_links_of_its_urdf_and_their_places_in_its_file
     expected = poses_on_the_cart(q)
     for name, T, T_root_link in zip(frames.names, frames.T_frame_link, robot.fk(q), strict=True):
         np.testing.assert_allclose(expected[name] @ T, T_root_link, atol=1e-12)
+
+
+_MJCF = """
+<mujoco model="bot">
+  <compiler angle="degree"/>
+  <worldbody>
+    <body name="stand" pos="0.2 0 0.5" euler="0 0 90">
+      <geom type="box" size=".08 .08 .05"/>
+      <body name="shoulder" pos="0 0 .1" euler="10 0 20">
+        <joint name="pan" axis="0 1 1" pos="0.01 0 0.02" ref="25" range="-90 120"/>
+        <geom type="capsule" fromto="0 0 0 0 0 .3" size=".05"/>
+        <body name="bracket" pos="0 0 .2" euler="40 0 0">
+          <body name="fore" pos="0 0 .1" euler="10 20 30">
+            <joint name="slide" type="slide" axis="0 0.6 -0.8" ref="0.03" range="-.1 .2"/>
+            <geom type="sphere" size=".03"/>
+            <body name="wrist" pos=".1 0 .1"><joint name="roll" axis="1 0 0" range="-90 90"/>
+              <geom type="sphere" size=".03"/>
+            </body>
+          </body>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def test_a_robot_from_mjcf_has_the_bodies_of_its_joints_as_links_where_mujoco_has_them(tmp_path: Path) -> None:
+    (tmp_path / "bot.xml").write_text(_MJCF)
+    save_robot(read_mjcf(tmp_path / "bot.xml").robot, tmp_path / "bot.json")
+    robot = read_robot(tmp_path / "bot.json")
+    frames = robot.link_frames
+    assert frames is not None
+    assert frames.names == ("stand", "shoulder", "fore", "wrist")
+    model = mujoco.MjModel.from_xml_string(_MJCF)
+    data = mujoco.MjData(model)
+    bodies = [data.body(name) for name in frames.names]
+    for q in robot.random(5, np.random.default_rng(1)):
+        data.qpos[:] = q
+        mujoco.mj_kinematics(model, data)
+        T_world = [matrix(body.xpos, Rotation.from_matrix(body.xmat.reshape(3, 3))) for body in bodies]
+        T_world_base = T_world[0] @ frames.T_frame_link[0]
+        for T_frame, T, T_base_link in zip(T_world, frames.T_frame_link, robot.fk(q), strict=True):
+            np.testing.assert_allclose(T_frame @ T, T_world_base @ T_base_link, atol=1e-9)
 
 
 def test_a_robot_of_an_earlier_version_loads_without_names(tmp_path: Path) -> None:

@@ -202,6 +202,8 @@ def test_a_mujoco_model_is_read_as_mujoco_moves_it(tmp_path: Path, rng: np.rando
                 if body not in ("left", "right"):  # which the model's reference posture fixes
                     assert (np.linalg.norm(at - middle, axis=1) < s.radii).any()
     assert uncovered(robot.shapes, robot.spheres()) <= 0
+    assert robot.link_frames is None
+    assert any("TF cannot mask the robot" in note for note in reading.notes)
     assert any("no mass" in note for note in reading.notes)  # two joints of one body: nothing is between them
 
 
