@@ -25,6 +25,9 @@ class _Command(NamedTuple):
 # The summaries are here, not in the modules, because `splatbot --help` must not wait for torch or open3d.
 COMMANDS = {
     "map": _Command("splatbot.cli.map", "map_log_command", "Turn an RGB-D log into a Gaussian map and a run folder."),
+    "batch": _Command(
+        "splatbot.cli.batch", "batch", "Run a command for many logs or options, in parallel or on a Ray cluster."
+    ),
     "train": _Command(
         "splatbot.cli.train", "train", "Train a map from posed photographs, or improve the map of a run."
     ),
