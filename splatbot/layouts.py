@@ -20,6 +20,7 @@ LogKind = Literal[
     "lerobot",
     "realsense",
     "rig",
+    "consecutive",
     "colmap",
 ]
 
@@ -40,8 +41,8 @@ _SOG_NAME = "meta.json"  # of a map in a folder of WebP images
 _LAYOUTS_HINT = (
     "known folders: rgb.txt with depth.txt (TUM), results/ with traj.txt (Replica), metadata.yaml (ROS 2), 7-Scenes. "
     "More folders: color/ with depth/ (Open3D, ScanNet), meta/info.json (LeRobot), Nerfstudio or COLMAP with depth/. "
-    "Known files: .mcap, .bag, .sens, .r3d, .db3 (RealSense), .yaml (several cameras); `synthetic:tabletop` needs no "
-    "files"
+    "Known files: .mcap, .bag, .sens, .r3d, .db3 (RealSense), .yaml (several cameras or recordings). "
+    "`synthetic:tabletop` needs no files"
 )
 _LIBREALSENSE = b"/device_0/sensor_"  # beginning of the topics of librealsense
 _FILES: dict[str, LogKind] = {".mcap": "bag", ".bag": "bag", ".sens": "scannet", ".r3d": "record3d"}
@@ -127,6 +128,8 @@ def _kind(path: Path) -> LogKind | None:
             return "realsense"
         if suffix in (".yaml", ".yml") and _names(path, b"cameras:"):
             return "rig"
+        if suffix in (".yaml", ".yml") and _names(path, b"recordings:"):
+            return "consecutive"
         return _FILES.get(suffix) if path.exists() else None
     if (path / "metadata.yaml").exists():
         return "bag"

@@ -36,8 +36,8 @@ class ChangeConstants:
         least_size: [m] its largest side.
         reach: [px] half the side of the window in which a view must see through a point, and may not hit it. It covers
             the errors of poses.
-        same_size, same_color: largest difference of the sides [share of the side] of an object that moved if the colours
-            are equal, and of the colours [0..1] if the sides are. Other objects of a place are as similar by chance.
+        same_size, same_color: largest difference of the sides [share of the side] of an object that moved if the
+            colours are equal, and of the colours [0..1] if the sides are. Beyond, other objects are as similar.
         color_quantiles: quantiles of each channel that describe the colours of an object.
     """
 
@@ -125,7 +125,7 @@ def _seen_through(
 ) -> tuple[Array, Array]:
     """Return confirmed surface points (P, 3) [m] of views that other views see through, and their colours (P, 3)."""
     space = find_confirmed(views, floor=floor, quad=quad, agreeing_views=CONSTANTS.confirming_views)
-    passes, hits = _around(space.surface, others)
+    passes, hits = evidence_around(space.surface, others)
     gone = np.flatnonzero((passes >= CONSTANTS.passing_views) & (hits == 0))
     column, row = space.pixel[gone].T
     shades = np.array([colors[v][y, x] for v, y, x in zip(space.view[gone], row, column, strict=True)]).reshape(-1, 3)
@@ -134,8 +134,12 @@ def _seen_through(
     return space.surface[gone][first], shades[first] / 255.0
 
 
-def _around(points: Array, views: Sequence[DepthView]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Count the views that pass points (P, 3) with all pixels of a window, and those that hit them with one of it."""
+def evidence_around(points: Array, views: Sequence[DepthView]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Count the views that see through points (P, 3) [m, world], and those that hit them.
+
+    All pixels of a window must see through a point, and one of them hits it. So errors of poses by a pixel do not make
+    the edge of an object vanish.
+    """
     passes, hits = np.zeros(len(points), np.int64), np.zeros(len(points), np.int64)
     window = np.ones((2 * CONSTANTS.reach + 1,) * 2, np.uint8)
     for depth, camera, T_world_camera in views:
@@ -143,8 +147,8 @@ def _around(points: Array, views: Sequence[DepthView]) -> tuple[NDArray[np.int64
         nearest = _float(cv2.erode(known, window))  # 0 where a pixel of the window is unknown
         rows, measured, z = measured_depths(points, nearest, camera, T_world_camera)
         passes[rows[measured - z > passing_distance(z)]] += 1
-        least = _float(cv2.erode(np.where(known > 0, known, np.float32(np.inf)), window))  # infinite without depth
         farthest = _float(cv2.dilate(known, window))
+        least = np.where(farthest > 0, _float(cv2.erode(np.where(known > 0, known, farthest.max()), window)), 0)
         rows, below, z = measured_depths(points, least, camera, T_world_camera)
         _, above, _ = measured_depths(points, farthest, camera, T_world_camera)
         tolerance = passing_distance(z)

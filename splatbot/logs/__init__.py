@@ -12,6 +12,7 @@ from splatbot.logs.base import Log
 from splatbot.logs.calibration import Calibration
 from splatbot.logs.colmap import OPTIONS as COLMAP_OPTIONS
 from splatbot.logs.colmap import ColmapLog
+from splatbot.logs.consecutive import ConsecutiveLog
 from splatbot.logs.image_folder import ImageFolderLog
 from splatbot.logs.record import record
 from splatbot.logs.record3d import Record3dLog
@@ -44,7 +45,8 @@ def open_log(
     Args:
         uri: a folder in TUM, Replica, 7-Scenes, Open3D, ScanNet, Nerfstudio or COLMAP layout, or a `.sens` or `.r3d`
             file. A recording of RealSense is a `.db3` or `.bag`. A recording of ROS topics is an `.mcap`, a rosbag2
-            folder or a `.bag`. A `.yaml` file lists several cameras (:mod:`splatbot.logs.rig`). In a COLMAP folder,
+            folder or a `.bag`. A `.yaml` file lists several cameras (:mod:`splatbot.logs.rig`) or recordings that
+            follow each other (:mod:`splatbot.logs.consecutive`). In a COLMAP folder,
             `?depth_scale=5000` gives units of depth per metre. Select one of several cameras by
             `FILE?color=TOPIC&depth=TOPIC&info=TOPIC`. In a LeRobot dataset, `FOLDER?episode=N&color=KEY&depth=KEY`
             selects an episode and a camera. In TUM folders and recordings of ROS topics, `?pair_within=0.05` is the
@@ -60,11 +62,13 @@ def open_log(
         CameraError: there are no usable intrinsics.
     """
     kind = log_kind(uri)
-    if kind == "rig":
+    if kind in _LISTS:
         if camera is not None:
-            hint = "write `camera: FILE` to each camera of the file"
-            raise LogError("each camera has its own.", file=uri, field="camera", hint=hint)
-        return RigLog(uri, lambda address, own: open_log(address, camera=own, missing=missing, joint_delay=joint_delay))
+            hint = "write `camera: FILE` to each entry of the file"
+            raise LogError("each recording has its own.", file=uri, field="camera", hint=hint)
+        return _LISTS[kind](
+            uri, lambda address, own: open_log(address, camera=own, missing=missing, joint_delay=joint_delay)
+        )
     if kind in _OWN_CAMERAS:
         if camera is not None:
             raise LogError("the log has its own camera.", file=uri, field="camera", hint="leave --camera out")
@@ -111,6 +115,10 @@ def _open_lerobot(uri: str, camera: str | Path | Calibration | None, joint_delay
     return LeRobotLog(folder, options=options, camera=camera, joint_delay=joint_delay)
 
 
+_LISTS: dict[LogKind, Callable[[str | Path, Callable[[str, str | None], Log]], Log]] = {
+    "rig": RigLog,
+    "consecutive": ConsecutiveLog,
+}
 _OWN_CAMERAS: dict[LogKind, Callable[[str], Log]] = {
     "synthetic": _open_synthetic,
     "scannet": ScanNetLog,
