@@ -55,7 +55,7 @@ def links_and_finger(robot: RobotModel) -> tuple[list[DrawnPart], list[DrawnPart
         FormatError: the stored meshes are damaged.
     """
     last, parts = len(robot), _link_meshes(robot)
-    if robot is panda():
+    if robot.shapes is panda().shapes:
         meshes = _panda_meshes()
         parts += [
             replace(piece, link=last, triangles=transform_points(T_LINK_HAND, piece.triangles))
@@ -104,10 +104,10 @@ def merged(parts: Sequence[DrawnPart]) -> list[DrawnPart]:
 
 
 def _has_panda_arm(robot: RobotModel) -> bool:
-    """Return whether the joints are those of the Panda; a name alone could be that of another arm."""
+    """Return whether origins and axes of joints are those of the Panda; a name alone could be that of another arm."""
     own = panda().joints
     return len(robot) == len(own) and all(
-        np.array_equal(a.T_before_joint, b.T_before_joint) for a, b in zip(robot.joints, own, strict=True)
+        np.array_equal(a.T_before_joint[:, 2:], b.T_before_joint[:, 2:]) for a, b in zip(robot.joints, own, strict=True)
     )
 
 

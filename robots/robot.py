@@ -147,7 +147,7 @@ class RobotModel:
         T[..., 0, :, :] = np.eye(4)
         for k, joint in enumerate(self.joints):
             T[..., k + 1, :, :] = (
-                T[..., k, :, :] @ joint.T_before_joint @ _joint_transform(values[..., k], joint.prismatic)
+                T[..., k, :, :] @ joint.T_before_joint @ joint_transform(values[..., k], joint.prismatic)
             )
         return T
 
@@ -293,7 +293,7 @@ def _covered(shapes: Sequence[Shape], slack: float) -> LinkSpheres:
     return cover(shapes, slack)
 
 
-def _joint_transform(q: Array, prismatic: bool) -> Array:
+def joint_transform(q: Array, prismatic: bool) -> Array:
     """Return the transforms (..., 4, 4) of a joint about or along z."""
     T = np.zeros((*q.shape, 4, 4))
     T[..., range(4), range(4)] = 1.0

@@ -93,10 +93,11 @@ def _reason(error: Exception) -> str:
 
 
 def workspace_of(uri: str, robot_base: Any) -> Workspace | None:
-    """Return the robot's base: that of the request, else that of the recording's scene.yaml."""
-    if robot_base is not None:
-        return Workspace(T_world_base=robot_base)
-    return None if uri.startswith("synthetic:") else find_workspace(uri)
+    """Return the scene of a recording; a base of the request replaces all of it but the joint offsets."""
+    known = None if uri.startswith("synthetic:") else find_workspace(uri)
+    if robot_base is None:
+        return known
+    return Workspace(T_world_base=robot_base, joint_offsets=None if known is None else known.joint_offsets)
 
 
 def open_rig(uri: str) -> tuple[Log, dict[str, Workspace]]:

@@ -14,6 +14,7 @@ from splatbot.collision import RobotSpheres
 from splatbot.errors import MapNotFoundError, SplatbotError
 from splatbot.planning import CertifiedMotion, MotionRefusedError, certify_motion
 from splatbot.planning.certify import JointCurve
+from splatbot.robots.joint_offsets import robot_in_scene
 from splatbot.robots.robot import RobotModel
 from splatbot.services.store import MapStore, ServedMap
 
@@ -77,7 +78,7 @@ class MotionGate:
         if request.T_world_base is not None and np.abs(request.T_world_base - base).max() > _SAME_POSE:
             hint = "plan without `base`, or correct the base of the map"
             raise MotionRefusedError("was made for another base than the arm's.", field="base", hint=hint)
-        arm = RobotSpheres(robot, T_world_base=base, margin=request.margin)
+        arm = RobotSpheres(robot_in_scene(robot, served.workspace), T_world_base=base, margin=request.margin)
         return certify_motion(request.motion, arm, served.field)
 
     def current(self, request: MotionRequest) -> ServedMap:

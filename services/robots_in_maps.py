@@ -9,6 +9,7 @@ from splatbot.collision import RobotSpheres
 from splatbot.errors import InputError
 from splatbot.planning.goals import suspect_degrees
 from splatbot.robots.graspable_objects import GraspableObjects, measured_map, segment_objects
+from splatbot.robots.joint_offsets import robot_in_scene
 from splatbot.robots.robot import RobotModel
 from splatbot.services.arms import known_robot
 from splatbot.services.schemas import Pose
@@ -30,11 +31,20 @@ def base_in(served: ServedMap, given: Pose | None) -> NDArray[np.float64]:
     return known
 
 
+def robot_in(served: ServedMap, robot: str) -> RobotModel:
+    """Return a robot by name, with the joint offsets of the scene of a map.
+
+    Raises:
+        InputError: the name is unknown, or the offsets are not those of this robot.
+    """
+    return robot_in_scene(known_robot(robot), served.workspace)
+
+
 def arm_in(
     served: ServedMap, robot: str, base: Pose | None, margin: float, opening: float | None = None
 ) -> tuple[RobotModel, RobotSpheres]:
     """Return a robot and its spheres at its base in the map."""
-    model = known_robot(robot)
+    model = robot_in(served, robot)
     return model, RobotSpheres(model, T_world_base=base_in(served, base), margin=margin, opening=opening)
 
 

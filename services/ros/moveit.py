@@ -17,9 +17,9 @@ from splatbot.planning.ik import solve_ik
 from splatbot.planning.timing import DEFAULT_SPEED
 from splatbot.results.margin import CONSTANTS as MARGIN
 from splatbot.robots.robot import RobotModel
-from splatbot.services.arms import known_robot
 from splatbot.services.margins import margin_source, plan_with_margin
 from splatbot.services.plan_obstacles import plan_obstacles
+from splatbot.services.robots_in_maps import robot_in
 from splatbot.services.ros.graph import RosGraph, Service
 from splatbot.services.ros.messages import MAP_FRAME
 from splatbot.services.ros.requests import entries, entry, has_content, joints, number, pose, vector
@@ -273,7 +273,7 @@ def robot_place(store: MapStore, robot: str) -> tuple[ServedMap, RobotModel, NDA
     if known is None:
         hint = "write a scene.yaml next to the map: splatbot info MAP --fit-plane"
         raise UnknownFrameError(f"the robot's base in map {served.id!r} is unknown.", field="base", hint=hint)
-    return served, known_robot(robot), known
+    return served, robot_in(served, robot), known
 
 
 def _joint_goal(goal: Any, robot: RobotModel) -> NDArray[np.float64]:

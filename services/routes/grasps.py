@@ -15,12 +15,11 @@ from splatbot.grasping.options import GraspOptions
 from splatbot.grasping.spatial import SpatialAffordance
 from splatbot.grasping.summary import summary
 from splatbot.results.margin import CONSTANTS as MARGIN
-from splatbot.services.arms import known_robot
 from splatbot.services.codecs import answer, answers, body_of, request_body
 from splatbot.services.dependencies import ServedAfterFrames, Service, problems
 from splatbot.services.margins import MarginSource, margin_source
 from splatbot.services.plan_obstacles import check_unknown, plan_obstacles
-from splatbot.services.robots_in_maps import base_in, objects_in
+from splatbot.services.robots_in_maps import base_in, objects_in, robot_in
 from splatbot.services.schemas import GraspsRequest
 from splatbot.services.topics import GRASPS
 
@@ -60,7 +59,7 @@ def grasps(request: Request, served: ServedAfterFrames, service: Service, query:
 
     Words match names, colours, shapes, sizes and places; an ambiguous description is refused.
     """
-    robot, base = known_robot(query.robot), base_in(served, query.base)
+    robot, base = robot_in(served, query.robot), base_in(served, query.base)
     check_unknown(served, query.unknown, query.base)
     objects = objects_in(served, base, as_known=query.base is None)
     found = find_target(_hint(query), objects.scene, [LanguageAffordance(), SpatialAffordance()])

@@ -6,10 +6,12 @@ import hashlib
 import os
 from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path as FilePath
 from typing import Annotated, Any
 
+import numpy as np
 from fastapi import APIRouter, Depends, Path, Request, Response
 from starlette.background import BackgroundTask
 from starlette.concurrency import run_in_threadpool
@@ -20,6 +22,7 @@ from splatbot.config import Config, with_cameras
 from splatbot.errors import InputError, MapNotFoundError
 from splatbot.formats import WRITTEN, save_gaussians
 from splatbot.logs import Log, open_log
+from splatbot.protocols import Array
 from splatbot.services.arms import known_robot
 from splatbot.services.codecs import ZIP, answer, answers, body_of, request_body
 from splatbot.services.dependencies import (
@@ -43,7 +46,7 @@ from splatbot.services.routes.jobs import accepted, starts
 from splatbot.services.schemas import Bounds, FurtherCameraInfo, MapInfo, MapList, MapRequest, RobotMaskInfo
 from splatbot.services.scratch import Scratch
 from splatbot.services.store import ServedMap
-from splatbot.workspace import find_workspace
+from splatbot.workspace import Workspace, find_workspace
 
 router = APIRouter(prefix="/v1/maps", tags=["maps"])
 
@@ -127,7 +130,7 @@ def create_map(
     base = query.robot_base.matrix("robot_base") if query.robot_base is not None else None
     if query.log is None:
         mask, config = _mask_of_stream(service, query), _with_cameras(service.config, query)
-        served = service.open_stream(query.id, workspace=workspace_of("synthetic:", base), mask=mask, config=config)
+        served = service.open_stream(query.id, workspace=_scene(query, "synthetic:", base), mask=mask, config=config)
         place = {"Location": f"/v1/maps/{query.id}"}
         return Response(_info(served).model_dump_json(), 201, place, media_type="application/json")
     if query.cameras:
@@ -142,7 +145,7 @@ def create_map(
     )
     log, mask = _open_masked(query, uri)
     total = check_length(log, limits.max_frames, query.max_frames)
-    workspace = workspace_of(uri, base)
+    workspace = _scene(query, uri, base)
     served = service.store.add(
         query.id, source=log.name, state="mapping", workspace=workspace, mask=mask, awaited=False
     )
@@ -315,6 +318,14 @@ def _camera_info(served: ServedMap, name: str, state: Mapping[str, Any]) -> Furt
 
 def _masked(mask: RobotMask) -> RobotMaskInfo:
     return RobotMaskInfo(name=mask.robot.name, masked=mask.masked, refused=mask.refused, problem=mask.problem)
+
+
+def _scene(query: MapRequest, uri: str, base: Array | None) -> Workspace | None:
+    """Return the scene of a map: base and joint offsets of the request, or those of the recording."""
+    known = workspace_of(uri, base)
+    if query.robot is None or query.robot.joint_offsets is None:
+        return known
+    return replace(known or Workspace(), joint_offsets=np.array(query.robot.joint_offsets))
 
 
 def _open_masked(query: MapRequest, uri: str) -> tuple[Log, RobotMask | None]:

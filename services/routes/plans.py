@@ -17,7 +17,7 @@ from splatbot.services.margins import margin_source, plan_with_margin
 from splatbot.services.plan_obstacles import check_unknown, plan_obstacles
 from splatbot.services.plans import Plan
 from splatbot.services.problems import TooLargeError
-from splatbot.services.robots_in_maps import arm_in, base_in, joints_of
+from splatbot.services.robots_in_maps import arm_in, base_in, joints_of, robot_in
 from splatbot.services.schemas import BASE_EXAMPLE, IkRequest, PlanRequest
 from splatbot.services.topics import PLAN
 
@@ -74,7 +74,7 @@ def plan(request: Request, served: ServedAfterFrames, service: Service, query: _
     if query.budget_ms > service.settings.max_plan_ms:
         hint = "give less, or raise SPLATBOT_MAX_PLAN_MS"
         raise TooLargeError(f"is more than {service.settings.max_plan_ms:g}.", field="budget_ms", hint=hint)
-    robot, base = known_robot(query.robot), base_in(served, query.base)
+    robot, base = robot_in(served, query.robot), base_in(served, query.base)
     start = robot.home if query.start is None else joints_of(robot, query.start, "start")
     goal = (
         PoseGoal(base @ query.goal_pose.matrix("goal_pose"))
@@ -135,7 +135,7 @@ def ik(request: Request, service: Service, query: Annotated[IkRequest, Depends(b
     version: dict[str, Any] = {}
     if query.map is not None:
         served = service.store.get(query.map)
-        _, arm = arm_in(served, query.robot, query.base, query.margin)
+        robot, arm = arm_in(served, query.robot, query.base, query.margin)
         field = served.field
         pose = inverse(arm.T_world_base) @ pose
         version["map_version"] = served.map_version

@@ -9,10 +9,11 @@ from fastapi import APIRouter, Depends, Response
 
 from splatbot.errors import InputError
 from splatbot.planning import JointTrajectory
+from splatbot.robots.robot import RobotModel
 from splatbot.services.codecs import body_of, plain, request_body
 from splatbot.services.dependencies import IdempotencyKey, Service, problems
 from splatbot.services.jobs import JobHandle
-from splatbot.services.robots_in_maps import base_in
+from splatbot.services.robots_in_maps import base_in, robot_in
 from splatbot.services.routes.jobs import accepted, starts
 from splatbot.services.schemas import BASE_EXAMPLE, TrialsRequest
 from splatbot.services.twins_of_maps import scene_of_map
@@ -43,6 +44,7 @@ def trials(
     own, a plan is followed; `notes` of a result describe the physics model of the map.
     """
     plan = service.plans.get(query.plan) if query.plan is not None else None
+    robot = None
     if query.map is None:
         scene = _shipped(query.scene or "empty")
         place: AbstractContextManager[Scene] = nullcontext(scene.with_effects(force=query.force, forbid=query.forbid))
@@ -52,13 +54,14 @@ def trials(
         raise InputError("is missing.", field="plan", hint="a map has no moves of its own: plan one in it")
     else:
         served = service.store.get(query.map)
+        robot = robot_in(served, plan.robot)
         _ = served.ready  # a map without a state is refused at once, not by the job
         place = scene_of_map(served, base_in(served, query.base), plan.robot, force=query.force, forbid=query.forbid)
 
     def work(handle: JobHandle) -> dict[str, Any]:
         with place as scene:
             trajectory = plan.trajectory if plan is not None else None
-            done = [_trial(scene, trajectory, query, i, handle) for i in range(query.trials)]
+            done = [_trial(scene, robot, trajectory, query, i, handle) for i in range(query.trials)]
         return {"scene": query.scene or ("empty" if query.map is None else None), "map": query.map, "trials": done}
 
     return accepted(service.jobs.submit("trials", work, key=key, request=query.model_dump_json())[0])
@@ -71,11 +74,16 @@ def _shipped(name: str) -> Scene:
 
 
 def _trial(
-    scene: Scene, trajectory: JointTrajectory | None, query: TrialsRequest, number: int, handle: JobHandle
+    scene: Scene,
+    robot: RobotModel | None,
+    trajectory: JointTrajectory | None,
+    query: TrialsRequest,
+    number: int,
+    handle: JobHandle,
 ) -> dict[str, Any]:
     from splatbot.sim.twin import Twin
 
-    twin = Twin(scene, seed=query.seed + number)
+    twin = Twin(scene, robot=robot, seed=query.seed + number)
     motion = motion_from_trajectory(trajectory) if trajectory is not None else None
 
     def progress(share: float) -> None:

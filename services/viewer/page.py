@@ -7,6 +7,7 @@ import numpy as np
 from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.gaussians import GaussianModel
 from splatbot.planning import JointTrajectory
+from splatbot.robots.joint_offsets import robot_in_scene
 from splatbot.robots.store import load_robot
 from splatbot.services.viewer.scene import ViewerScene, close_server, open_server
 from splatbot.services.viewer.splats import Coloring
@@ -41,7 +42,7 @@ def map_page(
         if trajectory is not None:
             scene.show_camera_path(trajectory)
         if workspace is not None and workspace.T_world_base is not None:
-            known = load_robot(robot)
+            known = robot_in_scene(load_robot(robot), workspace)
             arm = RobotSpheres(known, T_world_base=workspace.T_world_base)
             q = plan.start if plan is not None else np.asarray(known.home)
             scene.show_robot(arm, known, q, GaussianCollisionField(model))

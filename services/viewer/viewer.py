@@ -20,8 +20,8 @@ from splatbot.planning import JointTrajectory
 from splatbot.protocols import Array
 from splatbot.robots.robot import RobotModel
 from splatbot.services.access import Access
-from splatbot.services.arms import known_robot
 from splatbot.services.bus import Message
+from splatbot.services.robots_in_maps import robot_in
 from splatbot.services.store import MapStore, ServedMap
 from splatbot.services.threads import join_started
 from splatbot.services.topics import FRAME, GRASPS, PLAN, RESULT, STATE, TRAJECTORY, JointState
@@ -272,7 +272,7 @@ class Viewer:
             self._scene.show_camera_path(served.trajectory, self._camera)
         base = served.workspace.T_world_base if served.workspace is not None else None
         if base is not None and self._arm is None:
-            self._robot = known_robot(self._robot_name)
+            self._robot = robot_in(served, self._robot_name)
             self._arm = RobotSpheres(self._robot, T_world_base=base)
             self._scene.show_robot(self._arm, self._robot, np.asarray(self._robot.home), served.field)
 

@@ -128,7 +128,9 @@ def grasp(
     from splatbot.grasping.tags import TagAffordance
     from splatbot.report.grasp_view import grasp_png
     from splatbot.robots.appearance import appearance
+    from splatbot.robots.joint_offsets import robot_in_scene
     from splatbot.robots.store import load_robot
+    from splatbot.workspace import find_workspace
 
     options = GraspOptions(
         friction=friction,
@@ -140,7 +142,7 @@ def grasp(
         accept_implied=accept_implied,
         seed=seed,
     )
-    arm = load_robot(robot)
+    arm = robot_in_scene(load_robot(robot), find_workspace(map))
     with steps() as tell:
         tell("segmenting the objects of the map")
         objects = graspable_objects(map, base)

@@ -119,9 +119,11 @@ def plan(
     from splatbot.planning.closest import closest_approach
     from splatbot.report.plan_page import plan_html, plan_png
     from splatbot.robots.appearance import appearance, coarse_appearance
+    from splatbot.robots.joint_offsets import robot_in_scene
     from splatbot.robots.store import load_robot
+    from splatbot.workspace import find_workspace
 
-    arm = load_robot(robot)
+    arm = robot_in_scene(load_robot(robot), find_workspace(map))
     model = GaussianModel.load(file)
     T_world_base = base_pose(base, map)
     here = joint_values(start, arm, "--start")

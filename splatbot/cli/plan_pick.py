@@ -76,15 +76,17 @@ def plan_pick(
     from splatbot.cli.progress import steps
     from splatbot.grasping.grasp_file import GraspFile
     from splatbot.grasping.pick_types import PickOptions
+    from splatbot.robots.joint_offsets import robot_in_scene
     from splatbot.robots.store import load_robot
     from splatbot.sim.map_pick import pick_on_map, twin_of_pick
     from splatbot.sim.page import recording_html
+    from splatbot.workspace import find_workspace
 
     options = PickOptions(
         lift=lift, speed=speed, slow=slow, force=force, tries=tries, budget_ms=budget_ms, attempts=1, seed=seed
     )
     known = GraspFile.load(grasp)
-    robot = load_robot(known.robot)
+    robot = robot_in_scene(load_robot(known.robot), find_workspace(map))
     grasps = known.result(grasp_index, len(robot))
     here = joint_values(start, robot, "--start")
     known.check_map(file)

@@ -88,14 +88,19 @@ def twin(
     for flag, path in (("--json", json), ("--video", video), ("--html", html)):
         check_output(path, flag, folder=False)
 
+    from splatbot.robots.joint_offsets import robot_in_scene
     from splatbot.robots.store import load_robot
     from splatbot.sim.ledger import ledger
     from splatbot.sim.motion import load_motion
     from splatbot.sim.recording import TwinRecording
     from splatbot.sim.twin import Twin
+    from splatbot.workspace import find_workspace
 
     chosen = _scene(scene, map, base, with_camera=video is not None).with_effects(force=force, forbid=forbid)
-    it = Twin(chosen, robot=None if robot is None else load_robot(robot), timestep=timestep, seed=seed)
+    arm = None if robot is None else load_robot(robot)
+    if map is not None and chosen.robot is not None:
+        arm = robot_in_scene(arm or load_robot(chosen.robot.model), find_workspace(map))
+    it = Twin(chosen, robot=arm, timestep=timestep, seed=seed)
     motion = None
     if trajectory is not None and it.world.robot is not None:
         motion = load_motion(trajectory, it.world.robot)

@@ -1,0 +1,55 @@
+"""The command and the service plan with the joint offsets of a scene alike, for the true arm, in reported positions."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from splatbot.bench.tabletop import tabletop
+from splatbot.cli.plan import plan
+from splatbot.collision import GaussianCollisionField, RobotSpheres
+from splatbot.gaussians import GaussianModel, Snapshot
+from splatbot.geometry import rotation_to_quat
+from splatbot.robots.panda import panda
+from splatbot.services.ros.moveit import robot_place
+from splatbot.services.settings import ServiceSettings
+from splatbot.services.store import MapStore
+from splatbot.workspace import Workspace, find_workspace
+from tests.contracts.conftest import running
+
+OFFSETS = np.array([0.0, 0.03, -0.02, 0.04, 0.01, -0.03, 0.0])
+GOAL = np.array([0.9, -0.3, 0.1, -2.0, 0.2, 1.8, 0.5])  # true positions
+
+
+def test_the_true_arm_reaches_a_pose_and_is_free_although_the_plan_is_in_reported_positions(tmp_path: Path) -> None:
+    file = tmp_path / "map.ply"
+    tabletop().gaussians(4000).save(file)
+    Workspace(T_world_base=np.eye(4), joint_offsets=OFFSETS).save(tmp_path / "scene.yaml")
+    tool = panda().tcp(GOAL)
+    x, y, z, qw, qx, qy, qz = (float(value) for value in (*tool[:3, 3], *rotation_to_quat(tool[:3, :3])))
+    pose = x, y, z, qw, qx, qy, qz
+    out = tmp_path / "plan"
+    assert plan(map=file, start=("home",), goal_pose=pose, margin="0.01", budget_ms=300, out=out) == 0
+    paths = [np.array([p["positions"] for p in json.loads((out / "trajectory.json").read_text())["points"]])]
+    store, model = MapStore(), GaussianModel.load(file)
+    scene = find_workspace(file)
+    store.add("lab", source="a", state="static", snapshot=Snapshot(model, 1), workspace=scene)
+    body = {"goal_pose": {"translation": pose[:3], "quaternion_wxyz": pose[3:]}, "margin": 0.01, "budget_ms": 300}
+    with running(ServiceSettings(port=0), store) as service:
+        answer = service.client.post("/v1/maps/lab/plans", json=body).json()
+        paths.append(np.array([p["positions"] for p in answer["trajectory"]["points"]]))
+        checked = service.client.post("/v1/maps/lab/collisions", json={"q": (GOAL - OFFSETS)[None].tolist()}).json()
+        ik = service.client.post("/v1/ik", json={"pose": body["goal_pose"], "map": "lab", "near": GOAL.tolist()}).json()
+    arm, field = RobotSpheres(panda(), margin=0.009), GaussianCollisionField(model)
+    for q in paths:
+        np.testing.assert_allclose(q[0], panda().home, atol=1e-12)
+        np.testing.assert_allclose(panda().tcp(q[-1] + OFFSETS), tool, atol=1e-4)
+        assert panda().within_limits(q).all()
+        assert panda().within_limits(q + OFFSETS).all()
+        assert not arm.check(field, q + OFFSETS).in_collision.any()
+    true = RobotSpheres(panda()).clearance(field, GOAL[None]).distance
+    np.testing.assert_allclose(checked["clearance"], true, atol=1e-9)
+    np.testing.assert_allclose(panda().tcp(np.array(ik["q"][0]) + OFFSETS), tool, atol=1e-4)
+    np.testing.assert_allclose(robot_place(store, "panda")[1].fk(GOAL - OFFSETS), panda().fk(GOAL), atol=1e-12)
