@@ -54,6 +54,8 @@ COMMANDS = {
     "objects": _Command("splatbot.cli.objects", "objects", "List the supports and objects of a map with their sizes."),
     "export": _Command("splatbot.cli.export", "export", "Write a map as mesh, points, distance grid or occupancy."),
     "convert": _Command("splatbot.cli.convert", "convert", "Write a map in another format of Gaussian splats."),
+    "compact": _Command("splatbot.cli.compact", "compact", "Write a map of fewer Gaussians that still hits all it hit."),
+    "compare": _Command("splatbot.cli.compare", "compare", "Compare two maps as one HTML page with sliders."),
     "demo": _Command("splatbot.cli.demo", "demo", "Record, map, serve and query a synthetic tabletop."),
     "robot": _Command("splatbot.cli.robot", "robot", "Add a robot arm from a URDF, or describe a stored one."),
     "plan-pick": _Command(

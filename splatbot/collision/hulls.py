@@ -1,7 +1,7 @@
-"""Hulls of groups of Gaussians: ellipsoids that enclose their members at each number of standard deviations of 2 or more.
+"""Hulls of groups of Gaussians: ellipsoids that enclose their members at 2 and more standard deviations.
 
 A hull has the axes, and the ratios of the scales, of the mean and covariance of its members. It grows until it encloses
-each of them: with the hull as the unit ball, a member is A x + b for all x of the unit ball. For each p > 0, it is part
+each of them. With the hull as the unit ball, a member is A x + b for all x of the unit ball. For each p > 0, it is part
 of the centred ellipsoid of the matrix ``(1 + p) A Aᵀ + (1 + 1 / p) b bᵀ``, as in :mod:`splatbot.formats.enclosing`. At
 n standard deviations, b is b / n, so that the least n is the hardest case.
 """
@@ -72,7 +72,7 @@ def enclosing_hulls(model: GaussianModel, groups: Ints, n: int) -> Hulls:
     values, axes = np.linalg.eigh((group_sums(moments.reshape(-1, 9), groups, n) / sizes).reshape(-1, 3, 3))
     axes[:, :, 0] *= np.linalg.det(axes)[:, None]  # eigenvectors may be left-handed
     scales = np.sqrt(np.maximum(values, SCALE_FLOOR**2))
-    # What the file will hold is rounded before the growth is found, so that rounding cannot uncover a member.
+    # rounded to the precision of files before the growth is found, so that rounding cannot uncover a member
     centres = centres.astype(np.float32).astype(np.float64)
     quats = rotation_to_quat(axes).reshape(-1, 4).astype(np.float32).astype(np.float64)
     growth = np.zeros(n)

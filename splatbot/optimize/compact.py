@@ -2,8 +2,8 @@
 
 One group of all Gaussians is split, then always the groups that cost most, until their number is reached. The cost of a
 group is the square root of its volume times its image error. Thus many Gaussians remain where images show detail, and
-few where colours are even. Pruning by the same importance leaves holes (Mini-Splatting and LightGaussian close them by
-training), and a collision field would miss what it removes.
+few where colours are even. Pruning by the same importance leaves holes, which Mini-Splatting and LightGaussian close by
+training. A collision field would miss the removed surface.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from splatbot.collision import GaussianCollisionField
 from splatbot.collision.hulls import Array, Hulls, Ints, enclosing_hulls, group_sums
 from splatbot.collision.solids import SolidGate
 from splatbot.errors import InputError
@@ -26,18 +27,43 @@ class CompactConstants:
     """Constants of compaction.
 
     Args:
+        least_weight: [px] importance of a Gaussian that no view shows, so that its volume has a cost.
         evenness: [1] squared colour difference that a group of one colour counts, so that blur has a cost too.
         split_share: largest share of the groups that is split at once.
         least_opacity, most_opacity: limits of a group's opacity.
+        spheres: number of spheres that compare two fields.
+        reach: [m] standard deviation of their distance to Gaussians, and largest radius.
     """
 
+    least_weight: float = 0.01
     evenness: float = 1e-3
     split_share: float = 0.5
     least_opacity: float = 0.01
     most_opacity: float = 0.99
+    spheres: int = 100_000
+    reach: float = 0.02
 
 
 CONSTANTS = CompactConstants()
+
+
+@dataclass(frozen=True)
+class FieldChange:
+    """Answers of two collision fields to the same spheres near surfaces.
+
+    Args:
+        hit: number of spheres that hit the first field.
+        missed: number of those that the second one calls free.
+        free: number of spheres that are free in the first field.
+        blocked: number of those that hit the second one.
+        closer_m: mean loss of clearance of the free ones [m].
+    """
+
+    hit: int
+    missed: int
+    free: int
+    blocked: int
+    closer_m: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,14 +101,41 @@ def compact(model: GaussianModel, weights: Tensor, count: int) -> GaussianModel:
         raise InputError(f"is {count}.", field="count", hint="give 1 or more")
     counted = torch.from_numpy(SolidGate().solid(model)) | (weights > 0)
     if not bool(counted.any()):
-        raise InputError("has no Gaussian that images or collision checks count.", field="model", hint="map a log first")
-    model, weights = model.select(counted), weights[counted]
+        raise InputError(
+            "has no Gaussian that images or collision checks count.", field="model", hint="map a log first"
+        )
+    model, weights = model.select(counted), weights[counted].clamp_min(CONSTANTS.least_weight)
     if len(model) <= count:
         return model
     groups = _grouped(model, weights.double().numpy(), count)
     alone = torch.from_numpy(groups.sizes == 1)
     single = alone[torch.from_numpy(groups.of)]
     return GaussianModel.concatenate([model.select(single), _merged(model, weights, groups).select(~alone)])
+
+
+def field_change(before: GaussianModel, after: GaussianModel, n_sigma: float = 2.0, *, seed: int = 0) -> FieldChange:
+    """Compare the collision fields of two maps by random spheres around the Gaussians of the first one.
+
+    Raises:
+        InputError: no Gaussian of the first map is solid.
+    """
+    rng = np.random.default_rng(seed)
+    means = before.means.numpy()[SolidGate().solid(before)]
+    if len(means) == 0:
+        raise InputError("has no Gaussian that depth supports.", field="model", hint="map a log first")
+    points = means[rng.integers(0, len(means), CONSTANTS.spheres)]
+    points = points + rng.normal(0.0, CONSTANTS.reach, points.shape)
+    spheres = np.c_[points, rng.uniform(0.0, CONSTANTS.reach, len(points))]
+    fields = [GaussianCollisionField(model, n_sigma) for model in (before, after)]
+    hit, hit_after = (field.in_collision(spheres) for field in fields)
+    clearance, clearance_after = (field.clearance(spheres[~hit]).distance for field in fields)
+    return FieldChange(
+        hit=int(hit.sum()),
+        missed=int((hit & ~hit_after).sum()),
+        free=int((~hit).sum()),
+        blocked=int((hit_after & ~hit).sum()),
+        closer_m=float(np.mean(clearance - clearance_after)) if not hit.all() else 0.0,
+    )
 
 
 def _grouped(model: GaussianModel, weights: Array, count: int) -> _Groups:
@@ -107,7 +160,7 @@ def _grouped(model: GaussianModel, weights: Array, count: int) -> _Groups:
 def _assess(model: GaussianModel, colors: Array, weights: Array, of: Ints, n: int) -> _Groups:
     """Return groups with hulls and costs; the image error is Σ w |c - mean c|², as if all members had one colour."""
     hulls, sizes = enclosing_hulls(model, of, n), np.bincount(of, minlength=n)
-    total = np.maximum(np.bincount(of, weights, n), 1e-12)
+    total = np.bincount(of, weights, n)
     mean = group_sums(weights[:, None] * colors, of, n) / total[:, None]
     error = np.bincount(of, weights * ((colors - mean[of]) ** 2).sum(axis=1), n) + CONSTANTS.evenness * total
     costs = np.where(sizes > 1, np.sqrt(hulls.scales.prod(axis=1)) * error, 0.0)
@@ -115,7 +168,7 @@ def _assess(model: GaussianModel, colors: Array, weights: Array, of: Ints, n: in
 
 
 def _split(means: Array, groups: _Groups, chosen: Ints) -> tuple[Ints, Ints]:
-    """Split groups at the mean across their longest axis; return the group (N,) of each Gaussian, and changed groups."""
+    """Split groups across their longest axis; return the group (N,) of each Gaussian, and the changed groups."""
     n, hulls = len(groups.costs), groups.hulls
     rows = np.flatnonzero(np.isin(groups.of, chosen))
     of = groups.of[rows]
@@ -150,14 +203,13 @@ def _updated(groups: _Groups, of: Ints, fresh: Ints, part: _Groups) -> _Groups:
 def _merged(model: GaussianModel, weights: Tensor, groups: _Groups) -> GaussianModel:
     """Return one Gaussian a group: its hull, the mean colour by importance, and the opacity of equal area."""
     of, n = torch.from_numpy(groups.of), len(groups.costs)
-    shares = weights + 1e-6
-    sh = torch.zeros(n, *model.sh.shape[1:]).index_add_(0, of, model.sh * shares[:, None, None])
+    sh = torch.zeros(n, *model.sh.shape[1:]).index_add_(0, of, model.sh * weights[:, None, None])
     hulls = GaussianModel(
         means=torch.from_numpy(groups.hulls.means).float(),
         quats=torch.from_numpy(groups.hulls.quats).float(),
         log_scales=torch.from_numpy(np.log(groups.hulls.scales)).float(),
         opacity_logits=torch.zeros(n),
-        sh=sh / torch.zeros(n).index_add_(0, of, shares)[:, None, None],
+        sh=sh / torch.zeros(n).index_add_(0, of, weights)[:, None, None],
         observations=_reduced(model.observations, of, n, "amax"),
         anchors=_reduced(model.anchors, of, n, "amax"),
         uncertainty=_reduced(model.uncertainty, of, n, "amax"),

@@ -19,8 +19,8 @@ def blended_weights(model: GaussianModel, views: Iterable[tuple[Camera, NDArray[
     """Sum the blend weights (alpha times transmittance) of each Gaussian over the pixels of views, (N,) [px].
 
     Mini-Splatting (Fang, Wang 2024) ranks Gaussians by this sum. LightGaussian (Fan et al. 2024) adds a factor for the
-    volume, and Speedy-Splat (Hanson et al. 2025) uses the squared gradients instead. An image is the sum of colours times
-    weights, so that the gradient of the sum of its pixels to a colour is the sum of the weights.
+    volume, and Speedy-Splat (Hanson et al. 2025) uses squared gradients instead. An image is the sum of colours times
+    weights. So the gradient of the sum of its pixels to a colour is the sum of the weights.
 
     Args:
         model: the map.
