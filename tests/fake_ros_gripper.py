@@ -1,4 +1,4 @@
-"""A rosbridge server with a parallel gripper behind control_msgs/action/GripperCommand, for its clients.
+"""A rosbridge server with a gripper behind GripperCommand or ParallelGripperCommand of control_msgs, for its clients.
 
 It answers as ros2_control's gripper_action_controller, which sends no feedback, or as franka_ros2's franka_gripper,
 which never reports a stall.
@@ -37,6 +37,7 @@ class HandBehaviour:
         reject: goals are rejected.
         silent: goals get no answer, and have no effect.
         deaf: cancellations have no effect.
+        parallel: the action is ParallelGripperCommand, whose goals and results hold a sensor_msgs/JointState.
         abort_at, stall_at, drop_at: the goal is aborted, joint states end, all connections are cut.
         down_s: time without a server after a cut.
     """
@@ -51,6 +52,7 @@ class HandBehaviour:
     reject: bool = False
     silent: bool = False
     deaf: bool = False
+    parallel: bool = False
     abort_at: float = np.inf
     stall_at: float = np.inf
     drop_at: float = np.inf
@@ -99,7 +101,8 @@ class FakeRosGripper(FakeRosbridge):
         kind = operation["op"]
         if kind == "send_action_goal":
             assert operation["action"] == ACTION
-            assert operation["action_type"] == "control_msgs/action/GripperCommand"
+            prefix = "Parallel" if self.behaviour.parallel else ""
+            assert operation["action_type"] == f"control_msgs/action/{prefix}GripperCommand"
             self._begin(socket, operation["id"], operation["args"])
         elif kind == "cancel_action_goal":
             self._cancel(operation["id"])
@@ -119,7 +122,15 @@ class FakeRosGripper(FakeRosbridge):
             if self.behaviour.reject:
                 self._result(socket, name, "Action goal was rejected", 0, result=False)
                 return
-            self.target = float(args["command"]["position"])
+            command = args["command"]
+            if self.behaviour.parallel:
+                assert command["name"] == [JOINT]
+                (position,) = command["position"]
+                if command["velocity"]:
+                    (self.behaviour.speed,) = command["velocity"]
+            else:
+                position = command["position"]
+            self.target = float(position)
             self._goal = HandGoal(name, socket, self.target, time.monotonic())
 
     def _cancel(self, name: str) -> None:
@@ -161,7 +172,7 @@ class FakeRosGripper(FakeRosbridge):
 
     def _end(self, goal: HandGoal, status: int, *, reached: bool = False, stalled: bool = False) -> None:
         self._goal = None
-        values = {"position": self.finger, "effort": 0.0, "stalled": stalled, "reached_goal": reached}
+        values = self._state() | {"stalled": stalled, "reached_goal": reached}
         self._result(goal.socket, goal.name, values, status, result=True)
 
     def _result(self, socket: ServerConnection, name: str, values: object, status: int, *, result: bool) -> None:
@@ -169,9 +180,14 @@ class FakeRosGripper(FakeRosbridge):
         self._send(socket, json.dumps(answer | {"values": values, "status": status, "result": result}))
 
     def _feedback(self, goal: HandGoal) -> None:
-        values = {"position": self.finger, "effort": 0.0, "stalled": False, "reached_goal": False}
+        values = self._state() | ({} if self.behaviour.parallel else {"stalled": False, "reached_goal": False})
         answer = {"op": "action_feedback", "action": ACTION, "id": goal.name, "values": values}
         self._send(goal.socket, json.dumps(answer))
+
+    def _state(self) -> dict[str, Any]:
+        if self.behaviour.parallel:
+            return {"state": {"name": [JOINT], "position": [self.finger], "velocity": [], "effort": []}}
+        return {"position": self.finger, "effort": 0.0}
 
     def _report_state(self) -> None:
         stamp = dict(zip(("sec", "nanosec"), divmod(time.time_ns(), 10**9), strict=True))

@@ -1,4 +1,4 @@
-"""A gripper behind the action control_msgs/GripperCommand of ROS 2: goals and joint states over rosbridge."""
+"""A gripper behind GripperCommand or ParallelGripperCommand of ROS 2: goals and joint states over rosbridge."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Self
+from typing import Any, Literal, Self, get_args
 from uuid import uuid4
 
 from splatbot.errors import DeviceError, GripperError, InputError
@@ -19,7 +19,8 @@ from splatbot.robots.controllers.rosbridge import Operation, RosbridgeLink
 from splatbot.robots.grippers.checks import check_move
 from splatbot.robots.grippers.errors import FaultError, LineError, NoAnswerError
 
-_KIND = "control_msgs/action/GripperCommand"
+GripperAction = Literal["GripperCommand", "ParallelGripperCommand"]
+"""Actions of control_msgs for grippers."""
 _SUCCEEDED, _CANCELED, _ABORTED = 4, 5, 6  # action_msgs/GoalStatus
 _POLL_S = 0.01
 _SETTLE_S = 2.0  # [s] in which joint states must arrive, and a cancelled goal must end
@@ -56,6 +57,8 @@ class FingerJoint:
         name: its name in the joint states.
         closed, opened: position of the joint at the ends of the stroke [m or rad].
         stroke: widest opening [m].
+        lever: effort of the joint for each newton of a commanded force, in ParallelGripperCommand [1, or m for a joint
+            that turns].
 
     Raises:
         InputError: a value is out of range.
@@ -65,10 +68,14 @@ class FingerJoint:
     closed: float = 0.0
     opened: float = 0.04
     stroke: float = 0.08
+    lever: float = 1.0
 
     def __post_init__(self) -> None:
         if not 0.0 < self.stroke < math.inf:
             raise InputError(f"is {self.stroke}.", field="stroke", hint="give metres above 0")
+        if not 0.0 < self.lever < math.inf:
+            hint = "give 1 for a joint that slides, and metres for one that turns"
+            raise InputError(f"is {self.lever}.", field="lever", hint=hint)
         if not (math.isfinite(self.closed) and math.isfinite(self.opened)) or self.closed == self.opened:
             raise InputError(f"are {self.closed}, {self.opened}.", field="closed, opened", hint="give two positions")
 
@@ -80,6 +87,10 @@ class FingerJoint:
     def position(self, opening: float) -> float:
         """Convert an opening [m] to a position of the joint."""
         return self.closed + opening / self.stroke * (self.opened - self.closed)
+
+    def velocity(self, speed: float) -> float:
+        """Convert a speed [m/s] of the opening to that of the joint [1/s of its unit]."""
+        return speed / self.stroke * abs(self.opened - self.closed)
 
 
 @dataclass(frozen=True)
@@ -98,7 +109,7 @@ class GripperResult:
 
 
 class RosGripper:
-    """A :class:`splatbot.protocols.Gripper` that sends each move as one GripperCommand goal.
+    """A :class:`splatbot.protocols.Gripper` that sends each move as one goal of GripperCommand or of its successor.
 
     Openings are those of the joint states, because action servers need not send feedback. A lost connection, a goal
     that is refused, aborted or too late, and old joint states raise :class:`splatbot.errors.GripperError`; the goal is
@@ -109,8 +120,10 @@ class RosGripper:
         joint: the finger joint; a finger of the Panda by default.
         action: name of the action; that of the Panda is /franka_gripper/gripper_action.
         states: topic of the joint states.
-        force: largest force of a move without one, ``max_effort`` of the goal [N].
+        force: largest force of a move without one [N]: ``max_effort`` of GripperCommand. In ParallelGripperCommand it
+            is the effort of the joint, times its lever.
         options: times and tolerances.
+        kind: type of the action.
 
     Raises:
         InputError: a value is wrong.
@@ -126,11 +139,14 @@ class RosGripper:
         states: str = "/joint_states",
         force: float = 20.0,
         options: RosGripperOptions | None = None,
+        kind: GripperAction = "GripperCommand",
     ) -> None:
+        if kind not in get_args(GripperAction):
+            raise InputError(f"is {kind!r}.", field="kind", hint=f"use {' or '.join(get_args(GripperAction))}")
         if not 0.0 < force < math.inf:
             raise InputError(f"is {force}.", field="force", hint="give newtons above 0")
         self.joint, self.options, self._force = joint or FingerJoint(), options or RosGripperOptions(), force
-        self._action, self._topic = action, states
+        self._action, self._topic, self._kind = action, states, kind
         self._dialect = Ros2Action(action)
         self._states = ArmStates((self.joint.name,))
         self._news = threading.Condition()
@@ -172,15 +188,15 @@ class RosGripper:
         return self.joint.stroke
 
     def move(self, opening: float, *, force: float | None = None, speed: float | None = None) -> None:
-        """Send a goal with an opening [m] and a largest force [N]; an earlier goal is cancelled first.
+        """Send a goal with an opening [m], a largest force [N] and speed [m/s]; an earlier goal is cancelled first.
 
         Raises:
-            InputError: a value is out of range, or a speed is given: GripperCommand has none.
+            InputError: a value is out of range, or a speed is given, which GripperCommand does not have.
             GripperError: the connection is lost, or an earlier goal does not end.
         """
         check_move(self.stroke, opening, force, speed)
-        if speed is not None:
-            hint = "set the speed in the configuration of the gripper's controller"
+        if speed is not None and self._kind == "GripperCommand":
+            hint = "set the speed in the configuration of the gripper's controller, or use ParallelGripperCommand"
             raise InputError("cannot be commanded by GripperCommand.", field="speed", hint=hint)
         with self._secured():
             self._end_goal()
@@ -188,9 +204,9 @@ class RosGripper:
             with self._news:
                 self._goal, self._running, self._stopped, self._result = goal, True, False, None
                 self._target, self._begun, self._losses = opening, time.monotonic(), self._total_losses
-            effort = self._force if force is None else force
-            command = {"position": self.joint.position(opening), "max_effort": effort}
-            operation = {"op": "send_action_goal", "id": goal, "action": self._action, "action_type": _KIND}
+            command = self._command(opening, self._force if force is None else force, speed)
+            kind = f"control_msgs/action/{self._kind}"
+            operation = {"op": "send_action_goal", "id": goal, "action": self._action, "action_type": kind}
             self._goals.send(operation | {"feedback": True, "args": {"command": command}})
 
     def moving(self) -> bool:
@@ -239,6 +255,14 @@ class RosGripper:
         """
         with _as_line_error(self._action):
             self._cancel()
+
+    def _command(self, opening: float, force: float, speed: float | None) -> dict[str, Any]:
+        """Return the command of a goal: GripperCommand's own message, or a JointState with the limits of the move."""
+        joint, position = self.joint, self.joint.position(opening)
+        if self._kind == "GripperCommand":
+            return {"position": position, "max_effort": force}
+        velocity = [] if speed is None else [joint.velocity(speed)]
+        return {"name": [joint.name], "position": [position], "velocity": velocity, "effort": [force * joint.lever]}
 
     def _opening(self) -> float:
         latest = self._states.latest()

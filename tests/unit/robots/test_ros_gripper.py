@@ -1,4 +1,4 @@
-"""The client of GripperCommand against a gripper that speaks rosbridge on a socket."""
+"""The client of GripperCommand and ParallelGripperCommand against a gripper that speaks rosbridge on a socket."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import pytest
 from splatbot.errors import GripperError, InputError
 from splatbot.protocols import Gripper
 from splatbot.robots.grippers.errors import FaultError, LineError, NoAnswerError
-from splatbot.robots.grippers.ros import FingerJoint, RosGripper, RosGripperOptions
+from splatbot.robots.grippers.ros import FingerJoint, GripperAction, RosGripper, RosGripperOptions
 from tests.fake_ros_gripper import ACTION, FakeRosGripper, HandBehaviour
 from tests.waiting import until
 
@@ -24,7 +24,11 @@ PATIENT = RosGripperOptions(max_age=3.0)  # of a machine that is busy
 
 @contextmanager
 def connected(options: RosGripperOptions = PATIENT, **behaviour: Any) -> Iterator[tuple[RosGripper, FakeRosGripper]]:
-    with FakeRosGripper(HandBehaviour(**behaviour)) as hand, RosGripper(hand.address, options=options) as gripper:
+    kind: GripperAction = "ParallelGripperCommand" if behaviour.get("parallel") else "GripperCommand"
+    with (
+        FakeRosGripper(HandBehaviour(**behaviour)) as hand,
+        RosGripper(hand.address, options=options, kind=kind) as gripper,
+    ):
         yield gripper, hand
 
 
@@ -62,9 +66,40 @@ def test_a_goal_has_the_position_of_a_finger_and_the_force() -> None:
         ]
 
 
+def test_a_goal_of_the_parallel_action_is_a_joint_state_with_force_and_speed_of_the_joint() -> None:
+    with connected(parallel=True) as (gripper, hand):
+        gripper.move(0.03, force=12.5, speed=0.4)
+        gripper.wait(30.0)
+        gripper.move(0.08)
+        gripper.wait(30.0)
+        assert gripper.opening() == pytest.approx(0.08)
+        commands = [goal["command"] for goal in hand.goals]
+        name = ["panda_finger_joint1"]
+        assert commands[0] == {"name": name, "position": [pytest.approx(0.015)], "velocity": [pytest.approx(0.2)],
+                               "effort": [12.5]}  # fmt: skip
+        assert commands[1] == {"name": name, "position": [pytest.approx(0.04)], "velocity": [], "effort": [20.0]}
+    knuckle = FingerJoint("knuckle", closed=0.8, opened=0.0, stroke=0.085, lever=0.1)
+    assert knuckle.velocity(0.085) == pytest.approx(0.8)
+    with connected() as (gripper, hand), pytest.raises(InputError, match="kind: is 'Gripper'"):
+        RosGripper(hand.address, kind="Gripper")  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="lever"):
+        FingerJoint(lever=0.0)
+
+
+def test_a_stop_and_a_cancelled_goal_of_the_parallel_action_end_as_those_of_the_other() -> None:
+    with connected(parallel=True, speed=0.01, feedback=True) as (gripper, hand):
+        gripper.move(0.0)
+        until(lambda: hand.goals)
+        gripper.stop()
+        gripper.wait(30.0)
+        assert stands(hand)
+        assert hand.cancels >= 1
+
+
 @pytest.mark.parametrize("allow_stalling", [False, True])
-def test_fingers_that_stall_hold_the_object(allow_stalling: bool) -> None:
-    with connected(width=0.05, allow_stalling=allow_stalling) as (gripper, hand):
+@pytest.mark.parametrize("parallel", [False, True])
+def test_fingers_that_stall_hold_the_object(allow_stalling: bool, parallel: bool) -> None:
+    with connected(width=0.05, allow_stalling=allow_stalling, parallel=parallel) as (gripper, hand):
         gripper.move(0.0)
         gripper.wait(30.0)
         assert gripper.holds()
