@@ -10,8 +10,9 @@ from splatbot.robots.cameras.opencv import OpenCvCamera
 from splatbot.robots.cameras.orbbec import OrbbecCamera
 from splatbot.robots.cameras.realsense import RealsenseCamera
 from splatbot.robots.cameras.replay import ReplayCamera
+from splatbot.robots.cameras.rig import CameraRig
 
-__all__ = ["OakCamera", "OpenCvCamera", "OrbbecCamera", "RealsenseCamera", "ReplayCamera", "open_camera"]
+__all__ = ["CameraRig", "OakCamera", "OpenCvCamera", "OrbbecCamera", "RealsenseCamera", "ReplayCamera", "open_camera"]
 
 
 def open_camera(uri: str, *, joint_delay: float = 0.0) -> FrameSource:

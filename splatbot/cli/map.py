@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from splatbot.cli.cameras import open_recorded, refuse_with_camera
+from splatbot.cli.cameras import is_live, open_recorded, refuse_with_camera
 from splatbot.cli.doubts import camera_doubts, run_doubts
 from splatbot.cli.messages import print_message
 from splatbot.cli.paths import check_camera, check_file, check_output, check_state
@@ -71,7 +71,8 @@ def map_log_command(
         log: a folder in TUM or Replica layout, a recording of ROS topics (.mcap, rosbag2 folder, .bag), or
             synthetic:SCENE?... (see splatbot simulate --list). `LOG?pair_within=0.05` pairs colour and depth up to
             0.05 s apart (0.02 s by default). A camera is oak://, realsense:// or replay:LOG
-            (docs/guide/cameras.md).
+            (docs/guide/cameras.md). A .yaml file lists several logs or several cameras
+            (docs/guide/several-cameras.md).
         out: folder to write; by default runs/NAME-TIME, with a link runs/latest.
         config: YAML file; environment variables (SPLATBOT_MAPPING__MAX_GAUSSIANS=...) and then --set override it.
         overrides: one key of the configuration, as in mapping.max_gaussians=50000.
@@ -99,7 +100,7 @@ def map_log_command(
         hint = "leave --config, --set and --budget-ms out, or map the log again"
         raise InputError("a saved run keeps its configuration.", field="--config, --set, --budget-ms", hint=hint)
     if not dump_config:
-        device = is_camera(log)
+        device = is_live(log)
         if device:
             refuse_with_camera({"--camera": camera, "--robot": robot, "--resume": resume, "--rate": rate})
         elif seconds is not None:
@@ -117,19 +118,19 @@ def map_log_command(
 
     from splatbot.cli.map_page import page_of_map
     from splatbot.cli.progress import progress_display
-    from splatbot.logs.mcap import recover_mcap
+    from splatbot.logs.live import recover_recording
     from splatbot.robots.in_view import open_without_robot
     from splatbot.run import map_log
 
     if resume is not None:
-        recover_mcap(resume / RECORDING)  # of a camera whose run was killed
+        recover_recording(resume / RECORDING)  # of a camera whose run was killed
     saved = _saved_run(resume, localise)
     if resume is not None and saved is not None:
         log, camera, out = log or saved.place.uri, camera or saved.place.camera, out or resume
         robot = robot or saved.place.robot
     ends = ExitStack()
     if device:
-        folder = out or _new_folder(log.partition("?")[0])
+        folder = out or _new_folder(Path(log).stem if log.endswith((".yaml", ".yml")) else log.partition("?")[0])
         path = folder / RECORDING
         recorded = open_recorded(log, path, max_frames=max_frames, seconds=seconds, overwrite=overwrite)
         recording: Log = recorded

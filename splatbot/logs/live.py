@@ -1,22 +1,26 @@
-"""A camera that is recorded while its frames are used; afterwards it is the log of its recording."""
+"""Cameras that are recorded while their frames are used; afterwards they are the log of their recording."""
 
 from __future__ import annotations
 
 import logging
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import yaml
 
+from splatbot.atomic import atomic_write
 from splatbot.camera import Camera
 from splatbot.errors import LogError
 from splatbot.frame import Frame
 from splatbot.logs.bag import BagLog
 from splatbot.logs.base import Log, LogBase
-from splatbot.logs.mcap import McapFile, write_frame
+from splatbot.logs.mcap import McapFile, recover_mcap, write_frame
+from splatbot.logs.rig import RigLog, rig_entries
 from splatbot.logs.ros_frames import to_nanoseconds
 from splatbot.protocols import FrameSource
 from splatbot.trajectory import Trajectory
@@ -26,16 +30,43 @@ _LATE_S = 10.0  # time of frames whose stamps do not increase, after which the c
 _log = logging.getLogger(__name__)
 
 
-class RecordedCamera(LogBase):
-    """The frames of a camera, each of which is written into an MCAP file.
+def rig_file(path: str | Path) -> Path:
+    """Return the file that lists the recordings of several cameras, for the recording of the first one."""
+    return Path(path).with_suffix(".yaml")
 
-    A thread records every frame that the camera delivers, but for those whose stamps do not increase. :meth:`arrivals`
-    yields the newest one, so that a slow reader misses frames but the recording does not. Frames have the numbers and
-    stamps, to the nanosecond, of the recording. When it ended, the object is the log of the recording.
+
+def further_file(path: str | Path, name: str) -> Path:
+    """Return the recording of a further camera, for that of the first one; ``name`` is empty for the first camera."""
+    return Path(path).with_stem(f"{Path(path).stem}-{name}") if name else Path(path)
+
+
+def recover_recording(path: str | Path) -> None:
+    """Recover the recordings that a killed process left, if there are any.
+
+    Raises:
+        LogError: another process records into them.
+        OSError: the folder cannot be written to.
+    """
+    recover_mcap(path)
+    if rig_file(path).exists():
+        for name in list(rig_entries(rig_file(path)))[1:]:
+            recover_mcap(further_file(path, name))
+
+
+class RecordedCamera(LogBase):
+    """The frames of a camera, each of which is written into an MCAP file; several cameras have a file each.
+
+    The file of a further camera has its name: a.mcap becomes a-NAME.mcap, and a.yaml lists all of them. A thread
+    records every frame that the camera delivers, but for those whose stamps do not increase. :meth:`arrivals` yields
+    the newest one of each camera, so that a slow reader misses frames but the recording does not. Frames have the
+    numbers and stamps, to the nanosecond, of the recording. When it ended, the object is the log of the recording.
 
     Args:
         camera: the camera; it is opened here.
-        path: file of the recording.
+        path: file of the recording of the (first) camera.
+        cameras: settings of further cameras by their names (:class:`splatbot.logs.rig.RigLog`); ``camera`` yields their
+            frames, too, in the order of stamps.
+        first_name: name of the first camera, if there are several.
         max_frames: end after this number of frames; None for no end.
         seconds: end after this time [s]; None for no end.
         overwrite: replace the file if it exists, when the recording is complete.
@@ -50,15 +81,20 @@ class RecordedCamera(LogBase):
         camera: FrameSource,
         path: str | Path,
         *,
+        cameras: Mapping[str, Mapping[str, Any]] | None = None,
+        first_name: str = "first",
         max_frames: int | None = None,
         seconds: float | None = None,
         overwrite: bool = False,
     ) -> None:
-        self.name, self.uri = camera.name, str(path)
+        self._further = dict(cameras or {})
+        self._path = Path(path)
+        self.name, self.uri = camera.name, str(rig_file(path) if self._further else path)
         self._camera, self._max_frames, self._seconds = camera, max_frames, seconds
         self._changed = threading.Condition()
         self._count = 0
-        self._newest: tuple[int, Frame] | None = None
+        self._newest: dict[str, tuple[int, Frame]] = {}  # by the name of the camera
+        self._images: dict[str, Camera] = {}
         self._ended = False
         self._failure: Exception | None = None
         self._recording: Log | None = None
@@ -67,7 +103,15 @@ class RecordedCamera(LogBase):
         if first is None:
             raise LogError("ended before its first frame.", file=camera.uri, field="camera", hint="start it again")
         self._first = first
-        self._file = McapFile(path, overwrite=overwrite)
+        if self._further and rig_file(path).exists() and not overwrite:
+            raise LogError("exists already.", file=rig_file(path), hint="choose another name")
+        paths = {name: further_file(path, name) for name in ("", *self._further)}
+        self._files = {name: McapFile(own, overwrite=overwrite) for name, own in paths.items()}
+        if self._further:
+            entries = {name: {"log": paths[name].name, **values} for name, values in self._further.items()}
+            listed = {"cameras": {first_name: {"log": paths[""].name}, **entries}}
+            with atomic_write(self.uri) as file:
+                file.write(yaml.safe_dump(listed, sort_keys=False).encode())
         self._thread = threading.Thread(target=self._record, name="recording", daemon=True)
         self._timer = None if seconds is None else threading.Timer(seconds, self.end)  # a camera may be silent
         if self._timer is not None:
@@ -90,11 +134,21 @@ class RecordedCamera(LogBase):
         """Return the number of frames that the camera lost before they were recorded."""
         return self._camera.dropped
 
+    @property
+    def cameras(self) -> Mapping[str, Mapping[str, Any]]:
+        """See :class:`Log`."""
+        return self._further
+
     def __len__(self) -> int:
         return self._count
 
+    def has_newer(self, frame: Frame) -> bool:
+        """Return whether a newer frame of the same camera has arrived."""
+        with self._changed:
+            return frame.camera_name in self._newest
+
     def arrivals(self) -> Iterator[tuple[int, Frame]]:
-        """Yield number and frame of the newest frame that was not yielded yet, and close the recording at the end.
+        """Yield number and frame of the newest frames that were not yielded yet, and close the recording at the end.
 
         Raises:
             DeviceError: the camera is gone.
@@ -103,11 +157,12 @@ class RecordedCamera(LogBase):
         try:
             while True:
                 with self._changed:
-                    self._changed.wait_for(lambda: self._ended or self._newest is not None)
-                    newest, self._newest = self._newest, None
-                if newest is None:
-                    break
-                yield newest
+                    self._changed.wait_for(lambda: self._ended or self._newest)
+                    if not self._newest:
+                        break
+                    name = min(self._newest, key=lambda camera: self._newest[camera][0])
+                    oldest = self._newest.pop(name)
+                yield oldest
             if self._failure is not None:
                 raise self._failure
         finally:
@@ -130,27 +185,30 @@ class RecordedCamera(LogBase):
         if self._recording is not None:
             return
         try:
-            self._file.close()
+            for file in self._files.values():
+                file.close()
         except OSError as error:
             hint = f"free space on the disk; recording to {self.uri} again recovers the frames first"
             raise LogError(f"cannot be written ({error.strerror}).", file=self.uri, hint=hint) from error
-        self._recording = BagLog(self.uri)
+        self._recording = RigLog(self.uri, lambda path, _: BagLog(path)) if self._further else BagLog(self.uri)
 
     def _record(self) -> None:
-        begun, last = time.monotonic(), -np.inf
+        begun, last = time.monotonic(), (-np.inf, 0)
+        numbers = {name: number for number, name in enumerate(self._files)}
         late_since: float | None = None  # [s] of the monotonic clock, while stamps do not exceed the last one
         frame: Frame | None = self._first
         try:
             while frame is not None:
-                if frame.camera != self._first.camera:
+                if frame.camera != self._images.setdefault(frame.camera_name, frame.camera):
                     raise LogError("changed its images.", file=self.name, field="camera", hint="record two logs")
                 stamp = to_nanoseconds(frame.stamp) / 10**9
-                if stamp > last:
-                    last, late_since = stamp, None
+                order = stamp, numbers[frame.camera_name]
+                if order > last:
+                    last, late_since = order, None
                     delay = to_nanoseconds(frame.stamp + frame.depth_delay) / 10**9 - stamp
                     self._publish(replace(frame, index=self._count, stamp=stamp, depth_delay=delay))
                 else:
-                    late_since = self._left_out(stamp, last, late_since)
+                    late_since = self._left_out(stamp, last[0], late_since)
                 if self._count == self._max_frames:
                     break
                 if self._seconds is not None and time.monotonic() - begun >= self._seconds:
@@ -169,9 +227,9 @@ class RecordedCamera(LogBase):
 
     def _publish(self, frame: Frame) -> None:
         """Write a frame, and keep it for the reader as the recording has it."""
-        write_frame(self._file, frame)
+        write_frame(self._files[frame.camera_name], frame)
         with self._changed:
-            self._newest = self._count, frame
+            self._newest[frame.camera_name] = self._count, frame
             self._count += 1
             self._changed.notify_all()
 

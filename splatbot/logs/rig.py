@@ -13,7 +13,7 @@ import yaml
 from splatbot.camera import Camera
 from splatbot.errors import LogError
 from splatbot.frame import Frame
-from splatbot.layouts import log_kind
+from splatbot.layouts import is_camera, log_kind
 from splatbot.logs.base import Log, StampedLog
 from splatbot.logs.calibration import Calibration
 from splatbot.trajectory import Trajectory
@@ -74,9 +74,11 @@ class RigLog(StampedLog):
     def __init__(self, path: str | Path, opener: Opener) -> None:
         self.uri, self.name = str(path), Path(path).stem
         self._file = Path(path)
-        entries = _entries(self._file)
+        entries = rig_entries(self._file)
         self.parts = [self._part(name, values, opener) for name, values in entries.items()]
-        self._cameras = {part.name: _settings(part, entries[part.name]) for part in self.parts[1:]}
+        self._cameras = {
+            part.name: further_settings(entries[part.name], part.log.calibration.sensor) for part in self.parts[1:]
+        }
         ordered = sorted((t, k, i) for k, part in enumerate(self.parts) for i, t in enumerate(part.stamps))
         self.stamps = [stamp for stamp, _, _ in ordered]
         self._check_overlap()
@@ -116,18 +118,14 @@ class RigLog(StampedLog):
         return replace(frame, index=index, stamp=frame.stamp + part.time_offset, camera_name=name)
 
     def _part(self, name: str, values: Mapping[str, Any], opener: Opener) -> RigCamera:
-        where, offset = f"cameras.{name}", values.get("time_offset", 0.0)
-        if isinstance(offset, bool) or not isinstance(offset, int | float) or not abs(offset) <= _MAX_OFFSET_S:
-            raise self._wrong(f"{where}.time_offset", f"is {offset!r:.40}.", "give seconds")
-        for key in ("log", "camera"):
-            if not isinstance(values.get(key, ""), str):
-                raise self._wrong(f"{where}.{key}", "is no text.", "give a path")
-        if not values.get("log"):
-            raise self._wrong(f"{where}.log", "is missing.", _HINT)
         camera, address = values.get("camera"), self._beside(values["log"])
+        if is_camera(address):
+            hint = "name recordings only, or cameras only"
+            raise self._wrong(f"cameras.{name}.log", "is a camera, but others are recordings.", hint)
         if log_kind(address) == "rig":
-            raise self._wrong(f"{where}.log", "is a rig itself.", "name the recordings of its cameras")
-        return RigCamera(name, opener(address, self._beside(camera) if camera else None), float(offset))
+            raise self._wrong(f"cameras.{name}.log", "is a rig itself.", "name the recordings of its cameras")
+        opened = opener(address, self._beside(camera) if camera else None)
+        return RigCamera(name, opened, float(values.get("time_offset", 0.0)))
 
     def _beside(self, address: str) -> str:
         """Return an address, or the path of a file or folder relative to that of the rig."""
@@ -165,8 +163,12 @@ class _UniqueKeys(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
-def _entries(file: Path) -> dict[str, dict[str, Any]]:
-    """Return the values of each camera of a file, the first one first."""
+def rig_entries(file: Path) -> dict[str, dict[str, Any]]:
+    """Return the values of each camera of a file, the first one first.
+
+    Raises:
+        LogError: the file is damaged, or a camera has no ``log`` or a wrong ``time_offset``.
+    """
     try:
         found = yaml.load(file.read_text(encoding="utf-8"), Loader=_UniqueKeys)
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
@@ -184,11 +186,34 @@ def _entries(file: Path) -> dict[str, dict[str, Any]]:
             key = min(values.keys() - _FIRST_KEYS, key=str)
             hint = "the first camera defines the world; its sensor is the section `sensor` of --config or of its log"
             raise LogError("is not for the first camera.", file=file, field=f"cameras.{name}.{key}", hint=hint)
+        _check_entry(file, f"cameras.{name}", values)
     return cameras
 
 
-def _settings(part: RigCamera, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings of a further camera: those of the file, and the calibrated sensor of its recording."""
+def _check_entry(file: Path, where: str, values: Mapping[str, Any]) -> None:
+    offset = values.get("time_offset", 0.0)
+    if isinstance(offset, bool) or not isinstance(offset, int | float) or not abs(offset) <= _MAX_OFFSET_S:
+        raise LogError(f"is {offset!r:.40}.", file=file, field=f"{where}.time_offset", hint="give seconds")
+    for key in ("log", "camera"):
+        if not isinstance(values.get(key, ""), str):
+            raise LogError("is no text.", file=file, field=f"{where}.{key}", hint="give a path")
+    if not values.get("log"):
+        raise LogError("is missing.", file=file, field=f"{where}.log", hint=_HINT)
+
+
+def lists_cameras(uri: str) -> bool:
+    """Return whether a file lists live cameras instead of recordings.
+
+    Raises:
+        LogError: the file is damaged.
+    """
+    if log_kind(uri) != "rig":
+        return False
+    return is_camera(str(next(iter(rig_entries(Path(uri)).values()))["log"]))
+
+
+def further_settings(values: Mapping[str, Any], calibrated: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings of a further camera: those of the file, and its calibrated sensor."""
     own = {key: value for key, value in values.items() if key not in _FIRST_KEYS}
     sensor = own.get("sensor") or {}
-    return own | ({"sensor": {**part.log.calibration.sensor, **sensor}} if isinstance(sensor, dict) else {})
+    return own | ({"sensor": {**calibrated, **sensor}} if isinstance(sensor, dict) else {})

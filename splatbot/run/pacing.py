@@ -123,7 +123,7 @@ class CameraFrames(LogFrames):
         for index, frame in self.log.arrivals():
             self.dropped.extend(range(expected, index))
             yield Arrival(index, frame)
-            if len(self.log) > index + 1:
+            if self.log.has_newer(frame):
                 self.late.add(index)
             expected = index + 1
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from splatbot.cli import main
 from splatbot.logs import open_log
@@ -51,6 +52,7 @@ def test_a_mapped_camera_is_its_recording_for_other_commands(tmp_path: Path) -> 
     assert len(open_log(out / "recording.mcap")) == 3
 
 
+@pytest.mark.long
 def test_a_camera_that_drops_frames_is_scored_and_resumed_by_the_numbers_of_its_recording(tmp_path: Path) -> None:
     out = tmp_path / "run"
     words = ["--out", str(out), "--max-frames", "24", "--quiet", "--no-report"]
@@ -63,6 +65,7 @@ def test_a_camera_that_drops_frames_is_scored_and_resumed_by_the_numbers_of_its_
     assert main(["map", "--resume", str(out), "--quiet", "--no-report"]) == 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_one_signal_ends_a_silent_camera(tmp_path: Path, number: signal.Signals) -> None:
     words = ["record", f"{CAMERA}&stall=5&stall_s=300", "--out", str(tmp_path / "a.mcap")]
@@ -74,6 +77,7 @@ def test_one_signal_ends_a_silent_camera(tmp_path: Path, number: signal.Signals)
     assert len(open_log(tmp_path / "a.mcap")) == 5
 
 
+@pytest.mark.long
 def test_a_killed_run_of_a_camera_is_resumed_with_its_recording(tmp_path: Path) -> None:
     out = tmp_path / "run"
     words = ["map", CAMERA, "--out", str(out), "--save-every", "1", "--no-report", "--quiet"]
@@ -87,6 +91,28 @@ def test_a_killed_run_of_a_camera_is_resumed_with_its_recording(tmp_path: Path) 
     assert len(open_log(out / "recording.mcap")) >= 1
 
 
+@pytest.mark.long
+def test_several_cameras_are_mapped_live_and_a_killed_run_is_resumed_with_their_recordings(tmp_path: Path) -> None:
+    out, rig = tmp_path / "run", tmp_path / "rig.yaml"
+    carried = {"T_first_camera": {"translation": [0, 0, 0], "quaternion_wxyz": [1, 0, 0, 0]}, "time_offset": 0.001}
+    cameras = {"wrist": {"log": CAMERA}, "side": {"log": f"{CAMERA}.0", **carried}}
+    rig.write_text(yaml.safe_dump({"cameras": cameras}, sort_keys=False))
+    words = ["map", str(rig), "--out", str(out), "--save-every", "1", "--no-report", "--quiet"]
+    process = subprocess.Popen([sys.executable, "-m", "splatbot", *words])
+    until((out / "state" / "run.state").exists, 90)
+    time.sleep(2)
+    process.kill()
+    process.wait()
+    assert not list(out.glob("*.mcap"))
+    assert main(["map", "--resume", str(out), "--quiet", "--no-report"]) == 0
+    recording = open_log(out / "recording.yaml")
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["log"]["uri"] == str(out / "recording.yaml")
+    assert metrics["cameras"]["side"]["frames"] > 0
+    assert {frame.camera_name for frame in recording} == {"", "side"}
+    assert main(["map", str(rig), "--out", str(tmp_path / "few"), "--max-frames", "1", "--quiet"]) == 2
+
+
 def test_a_camera_that_is_lost_keeps_map_and_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "run"
     assert main(["map", f"{CAMERA}&unplug=12", "--out", str(out), "--quiet", "--no-report"]) != 0
@@ -95,6 +121,7 @@ def test_a_camera_that_is_lost_keeps_map_and_recording(tmp_path: Path, capsys: p
     assert len(open_log(out / "recording.mcap")) == 12
 
 
+@pytest.mark.long
 def test_a_recorded_camera_has_the_frames_of_the_camera(tmp_path: Path) -> None:
     out = tmp_path / "a.mcap"
     shown = at_a_terminal("record", CAMERA, "--out", str(out), columns=80, interrupt_at="frame 20,")
