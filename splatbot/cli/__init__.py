@@ -35,6 +35,8 @@ COMMANDS = {
         "splatbot.cli.eval", "eval_run", "Score a run or a training again: trajectory error and held-out views."
     ),
     "audit": _Command("splatbot.cli.audit", "audit", "Check a map against measured depth: missed surface, false hits."),
+    "merge": _Command("splatbot.cli.merge", "merge", "Merge two runs of one place into one run."),
+    "diff": _Command("splatbot.cli.diff", "diff", "List the objects that changed between two runs of one place."),
     "render": _Command("splatbot.cli.render", "render", "Render a view of a map to a PNG."),
     "info": _Command("splatbot.cli.info", "info", "Describe a map, a log or a run."),
     "download": _Command(
@@ -54,7 +56,7 @@ COMMANDS = {
     "objects": _Command("splatbot.cli.objects", "objects", "List the supports and objects of a map with their sizes."),
     "export": _Command("splatbot.cli.export", "export", "Write a map as mesh, points, distance grid or occupancy."),
     "convert": _Command("splatbot.cli.convert", "convert", "Write a map in another format of Gaussian splats."),
-    "compact": _Command("splatbot.cli.compact", "compact", "Write a map of fewer Gaussians that still hits all it hit."),
+    "compact": _Command("splatbot.cli.compact", "compact", "Write a map of fewer Gaussians that hits all it hit."),
     "compare": _Command("splatbot.cli.compare", "compare", "Compare two maps as one HTML page with sliders."),
     "demo": _Command("splatbot.cli.demo", "demo", "Record, map, serve and query a synthetic tabletop."),
     "robot": _Command("splatbot.cli.robot", "robot", "Add a robot arm from a URDF, or describe a stored one."),

@@ -68,7 +68,7 @@ class ChangedObject:
         axes: (3, 3) directions of the sides, as columns.
         shades: (5, 3) quantiles of each channel of its colour in 0..1, darkest first; the third is the median.
         points: number of voxels of its surface.
-        previous_center: (3,) centre in A of an object that moved; None for others.
+        previous: the removed object of A that it is, if it moved; None for others.
     """
 
     kind: Kind
@@ -77,7 +77,7 @@ class ChangedObject:
     axes: Array
     shades: Array
     points: int
-    previous_center: Array | None = None
+    previous: ChangedObject | None = None
 
 
 def find_changes(
@@ -192,7 +192,7 @@ def _with_moved(removed: Sequence[ChangedObject], appeared: Sequence[ChangedObje
             found.append(new)
             continue
         left = [other for other in left if other is not old]
-        found.append(replace(new, kind="moved", previous_center=old.center))
+        found.append(replace(new, kind="moved", previous=old))
     return [*found, *left]
 
 

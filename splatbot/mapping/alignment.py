@@ -36,6 +36,8 @@ class MapAlignmentConstants:
         least_agreeing: number of keyframes that must agree.
         least_share: share of the located keyframes that must agree. Repeated places confirm a wrong transform
             with a part of them.
+        least_sigma: [m], [rad] least standard deviation of the common transform, however well the keyframes agree: both
+            maps have errors that all keyframes share.
     """
 
     keyframes: int = 40
@@ -43,6 +45,7 @@ class MapAlignmentConstants:
     agreement: tuple[float, float] = (0.06, 0.06)
     least_agreeing: int = 3
     least_share: float = 0.6
+    least_sigma: tuple[float, float] = (1e-3, 5e-4)
 
 
 CONSTANTS = MapAlignmentConstants()
@@ -117,7 +120,8 @@ def align_maps(
     poses = {k.number: k.T_world_camera for k in chosen}
     agreeing = {n: found for n, found in second.items() if _agrees(common, found, poses[n])}
     T, covariance = fused([_world_of(found, poses[n]) for n, found in agreeing.items()])
-    return MapAlignment(T, covariance * _birge(T, agreeing, poses), agreeing, len(chosen), len(second))
+    least = np.diag(np.repeat(np.square(CONSTANTS.least_sigma), 3))
+    return MapAlignment(T, covariance * _birge(T, agreeing, poses) + least, agreeing, len(chosen), len(second))
 
 
 def _spread(keyframes: Sequence[Keyframe], most: int) -> list[Keyframe]:

@@ -106,38 +106,60 @@ def locate_run(a: SavedRun, b: SavedRun, report: Callable[[float], None] = lambd
         raise InputError(error.message, file=b.folder, field=error.field, hint=error.hint) from error
 
 
+@dataclass(frozen=True, eq=False)
+class AlignedRuns:
+    """Two runs, and the pose of the later one, B, in the world of A."""
+
+    a: SavedRun
+    b: SavedRun
+    alignment: MapAlignment
+
+
+def align_runs(
+    run_a: str | Path, run_b: str | Path, report: Callable[[float], None] = lambda _share: None
+) -> AlignedRuns:
+    """Load two runs that can be merged, and locate B in A.
+
+    Args:
+        run_a, run_b: folders of runs with a saved state.
+        report: called with the finished share of the alignment.
+
+    Raises:
+        FormatError: the state of a run is missing or damaged.
+        InputError: B is not found in A, or the runs cannot be merged.
+    """
+    a, b = load_run(run_a), load_run(run_b)
+    _check(a, b)
+    return AlignedRuns(a, b, locate_run(a, b, report))
+
+
 def merge_runs(
-    run_a: str | Path,
-    run_b: str | Path,
+    aligned: AlignedRuns,
     *,
     out: str | Path,
-    on_share: Callable[[float], None] = lambda _share: None,
     on_progress: Callable[[Progress], None] | None = None,
     map_page: MapPage | None = None,
     report: bool = True,
 ) -> MergedRun:
-    """Merge two runs into the run folder ``out``; run B is the later one.
+    """Merge two runs into the run folder ``out``.
 
-    The map of B is located in A and moved into its world. Surface of both is fused, and A loses what the depth of B
-    sees through, in its Gaussians and in its keyframes. The merged run is that of a log that plays both recordings
-    (``recordings.yaml``). It is refined, scored and reported like a mapped one.
+    Surface of both is fused, and A loses what the depth of B sees through, in its Gaussians and in its keyframes. The
+    merged run is that of a log that plays both recordings (``recordings.yaml``). It is refined, scored and reported
+    like a mapped one.
 
     Args:
-        run_a, run_b: folders of runs with a saved state.
+        aligned: the runs. Gaussians and keyframes of B are moved; the runs on disk stay as they are.
         out: folder to write; must hold no run.
-        on_share: called with the finished share of the alignment.
-        on_progress: called at every later phase.
+        on_progress: called at every phase.
         map_page: makes a page of the finished map for the report. If None, the report has no such page.
         report: audit the merged map and write the report.
 
     Raises:
-        FormatError: the state of a run is missing or damaged.
         LogError: the recording of a run is missing.
-        InputError: the maps do not overlap, or cannot be merged.
+        InputError: ``out`` holds a run, or cannot be written.
     """
-    a, b = load_run(run_a), load_run(run_b)
-    _check(a, b)
-    alignment = locate_run(a, b, on_share)
+    a, b, alignment = aligned.a, aligned.b, aligned.alignment
+    _check_empty(Path(out))
     folder = RunFolder.create(out)
     time_offset = _write_recordings(folder.path / RECORDINGS, a, b)
     log = open_log(folder.path / RECORDINGS)
@@ -162,6 +184,13 @@ def merge_runs(
     found = MergedRun(result, alignment, joined, time_offset)
     write_text(json.dumps(found.summary(), indent=2, allow_nan=False) + "\n")(folder.path / SUMMARY)
     return found
+
+
+def _check_empty(out: Path) -> None:
+    found = [name for name in ("map.ply", "metrics.json", "state", RECORDINGS) if (out / name).exists()]
+    if found:
+        hint = "name another folder"
+        raise InputError(f"holds a run already ({', '.join(found)}).", file=out, field="--out", hint=hint)
 
 
 def _check(a: SavedRun, b: SavedRun) -> None:
