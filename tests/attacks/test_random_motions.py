@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import pytest
+
 from tests.attacks.random_motions import SPOILED, run
 
 
+@pytest.mark.long
 def test_no_motion_is_let_through_that_the_check_at_1_khz_rejects() -> None:
     tally = run(400, seed=1)
     assert tally.wrong == []

@@ -161,6 +161,7 @@ def check_log(seconds: float, folder: Path) -> None:
     assert counts["bare"] > 100
 
 
+@pytest.mark.long
 def test_the_arm_stays_out_of_a_map_of_pushed_frames_with_late_joint_states_too() -> None:
     check_http(3.0)
 
@@ -169,6 +170,7 @@ def test_the_arm_stays_out_of_a_map_of_ros_topics(tmp_path: Path) -> None:
     check_ros(3.0, tmp_path / "scene.yaml")
 
 
+@pytest.mark.long
 def test_the_arm_stays_out_of_a_recording_that_a_client_names(tmp_path: Path) -> None:
     check_log(3.0, tmp_path)
 

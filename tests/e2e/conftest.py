@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 import shutil
 import subprocess
@@ -12,6 +14,7 @@ from typing import Any
 
 import pytest
 
+from splatbot.cli import main
 from splatbot.logs import open_log
 from splatbot.logs.record import record
 
@@ -32,6 +35,14 @@ def splatbot(*words: object, timeout: float = 300.0) -> Answer:
         [*COMMAND, *(str(word) for word in words)], capture_output=True, text=True, timeout=timeout, check=False
     )
     return Answer(done.returncode, done.stdout, done.stderr)
+
+
+def splatbot_here(*words: object) -> Answer:
+    """Run `splatbot WORDS...` in this process, without the seconds in which a new one loads its libraries."""
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        code = main([str(word) for word in words])
+    return Answer(code, out.getvalue(), err.getvalue())
 
 
 def metrics_of(folder: Path) -> dict[str, Any]:

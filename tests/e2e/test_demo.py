@@ -31,6 +31,7 @@ def _slam_that_is_off_by(metres: float) -> type[OracleSlam]:
     return Shifted
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("metres", "exit_code"), [(0.0, 0), (0.1, 1)])
 def test_the_demo_fails_exactly_when_the_map_contradicts_the_scene(
     metres: float, exit_code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -52,6 +52,7 @@ def kill_while_mapping(words: list[str], state: Path, seconds: float) -> None:
     run.wait(timeout=30)
 
 
+@pytest.mark.long
 def test_killed_at_any_time_a_run_opens_and_ends_as_if_nothing_had_happened(whole: Trajectory, tmp_path: Path) -> None:
     draw = random.Random(7)
     out, state = tmp_path / "run", tmp_path / "run" / "state" / "run.state"

@@ -16,7 +16,7 @@ import pytest
 from splatbot.gaussians import GaussianModel
 from splatbot.run.state import SavedRun
 from splatbot.trajectory import Trajectory
-from tests.e2e.conftest import COMMAND, N_FRAMES, metrics_of, splatbot
+from tests.e2e.conftest import COMMAND, N_FRAMES, metrics_of, splatbot, splatbot_here
 
 BAD = 6  # the frame that is damaged
 NAMES = {"config.yaml", "trajectory.tum", "frames.jsonl", "metrics.json", "map.ply", "report.html", "map.html", "state"}
@@ -69,7 +69,7 @@ def test_a_bad_frame_names_file_field_and_fix_and_the_frames_before_it_are_kept(
     damage: Callable[[Path], None], file: str, field: str, log_copy: Path, tmp_path: Path
 ) -> None:
     damage(log_copy)
-    answer = splatbot("map", log_copy, "--out", tmp_path / "run", "--no-report")
+    answer = splatbot_here("map", log_copy, "--out", tmp_path / "run", "--no-report")
     assert answer.code == 2, answer.err
     assert "Traceback" not in answer.err
     message = answer.err.splitlines()[-1]
@@ -111,7 +111,7 @@ def test_a_log_that_cannot_be_mapped_is_refused_and_leaves_no_run(
     damage: Callable[[Path], None], file: str, fix: str, log_copy: Path, tmp_path: Path
 ) -> None:
     damage(log_copy)
-    answer = splatbot("map", log_copy, "--out", tmp_path / "run")
+    answer = splatbot_here("map", log_copy, "--out", tmp_path / "run")
     assert answer.code == 2
     assert answer.err.startswith("error: ")
     assert file in answer.err.partition(" Fix: ")[0]
@@ -124,7 +124,7 @@ def test_a_log_that_cannot_be_mapped_is_refused_and_leaves_no_run(
 def test_a_truncated_map_names_file_field_and_fix(command: str, sound_run: Path, tmp_path: Path) -> None:
     path = tmp_path / "cut.ply"
     path.write_bytes((sound_run / "map.ply").read_bytes()[:-1000])
-    answer = splatbot(command, path)
+    answer = splatbot_here(command, path)
     assert answer.code == 2
     assert answer.err.startswith(f"error: {path}: ")
     assert " Fix: " in answer.err

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+import pytest
 
 from splatbot.logs import open_log
 from splatbot.logs.record import record
@@ -27,6 +28,7 @@ def _until_not_mapping(client: httpx.Client) -> tuple[list[int], dict[str, Any]]
     raise AssertionError(f"still mapping: {described}")
 
 
+@pytest.mark.long
 def test_versions_grow_while_a_log_is_mapped_and_the_map_is_served_after_its_end() -> None:
     with serving("--log", "synthetic:tabletop?frames=16&width=320&height=240") as (_, client):
         versions, described = _until_not_mapping(client)
@@ -41,6 +43,7 @@ def test_versions_grow_while_a_log_is_mapped_and_the_map_is_served_after_its_end
         assert client.get("/v1/maps/default/render").headers["content-type"] == "image/png"
 
 
+@pytest.mark.long
 def test_a_damaged_log_is_reported_and_the_map_is_served(tmp_path: Path) -> None:
     log = record(open_log("synthetic:tabletop?frames=6&width=320&height=240"), tmp_path / "log")
     broken = sorted((log / "rgb").iterdir())[4]

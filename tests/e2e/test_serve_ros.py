@@ -17,6 +17,7 @@ from tests.e2e.test_serve_cli import serving
 LOG = "synthetic:tabletop?frames=12&width=160&height=120"
 
 
+@pytest.mark.long
 def test_a_camera_that_is_unplugged_leaves_its_map_odometry_and_a_recording_that_is_a_log(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

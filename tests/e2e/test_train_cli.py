@@ -71,6 +71,7 @@ def test_a_scene_becomes_a_map_with_scores_pictures_and_poses(scene: Path, tmp_p
     assert "--resume" in err
 
 
+@pytest.mark.long
 def test_ctrl_c_keeps_the_trained_map_and_the_run_can_be_resumed(scene: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     process = start(str(scene), "--iterations", "1000000", "--checkpoint-every", "0.2", "--out", str(out))
@@ -144,6 +145,7 @@ def test_a_run_killed_at_random_moments_ends_with_the_bits_of_one_that_was_not(s
     assert (cut / "map.ply").read_bytes() == (whole / "map.ply").read_bytes()
 
 
+@pytest.mark.long
 def test_the_map_of_a_run_is_improved_in_place_and_the_earlier_one_kept(tmp_path: Path) -> None:
     run = tmp_path / "run"
     words = ("synthetic:tabletop?frames=10&width=160&height=120", "--out", str(run), "--quiet")

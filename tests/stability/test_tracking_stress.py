@@ -104,6 +104,7 @@ def test_poses_before_a_wall_are_no_nearer_to_it_than_they_say() -> None:
     assert nees_of(log, seldom_refined, width=640) < 2.0
 
 
+@pytest.mark.long
 def test_poses_around_a_wall_of_soft_colours_err_no_more_than_they_say() -> None:
     """Each new strip of the wall is observed once, and the bias of its blend accumulates around the wall."""
     seldom_refined = load_config(environ={}, overrides={"mapping.refine_iterations": 2})

@@ -322,6 +322,7 @@ def test_a_lost_pose_file_is_noticed(log: Log, tmp_path: Path) -> None:
         RunFolder(tmp_path / "run").load_poses()
 
 
+@pytest.mark.long
 def test_memory_does_not_grow_with_the_log(log: Log, tmp_path: Path) -> None:
     alive: list[weakref.ref[Frame]] = []
     most = 0

@@ -24,6 +24,7 @@ def results(folder: Path) -> Results:
     return BENCHMARK.run(CollisionSettings(out=folder, peers=True, quick=True))
 
 
+@pytest.mark.long
 def test_speed_and_memory_are_measured_at_every_size(results: Results) -> None:
     for count in CollisionSettings.quick_values["counts"]:
         for threads in ("1 thread", "2 threads"):

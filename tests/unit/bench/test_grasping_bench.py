@@ -17,6 +17,7 @@ def ran(tmp_path_factory: pytest.TempPathFactory) -> Results:
     return BENCHMARK.run(GraspingSettings(out=tmp_path_factory.mktemp("grasping"), quick=True))
 
 
+@pytest.mark.long
 def test_every_case_has_its_figures(ran: Results) -> None:
     for case in ("10000 Gaussians", "50 samples", "100 samples"):
         for metric in ("to a ranked list, median", "candidates", "graspable objects with a grasp", "checked grasps"):
@@ -30,6 +31,7 @@ def test_contacts_are_within_three_millimetres_of_the_exact_shapes(ran: Results)
         assert off < 3.0
 
 
+@pytest.mark.long
 def test_the_command_writes_its_rows(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "grasping", "--quick", "--out", str(tmp_path), "--json", str(tmp_path / "f.json")]) == 0
     assert "to a ranked list" in capsys.readouterr().out

@@ -111,6 +111,7 @@ def test_a_run_that_is_none_is_refused(tmp_path: Path, capsys: pytest.CaptureFix
     assert "map.ply" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_the_command_plans_on_the_map_of_a_film(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "planning", "--quick", "--mapped", "--out", str(tmp_path)]) == 0
     out = capsys.readouterr().out

@@ -14,6 +14,7 @@ from splatbot.bench.training.sweep import simulated_data
 from splatbot.errors import InputError
 
 
+@pytest.mark.long
 def test_each_strategy_has_its_figures_and_the_plot_is_drawn(tmp_path: Path) -> None:
     results = BENCHMARK.run(TrainingBenchSettings(out=tmp_path, quick=True))
     with (tmp_path / "training.csv").open() as file:

@@ -6,6 +6,7 @@ import itertools
 
 import mujoco
 import numpy as np
+import pytest
 
 from splatbot.bench.results import Results
 from splatbot.bench.tabletop import tabletop
@@ -55,6 +56,7 @@ def test_a_pushed_path_ends_a_centimetre_deep() -> None:
     assert float(arm_clearance(panda(), tabletop(), into[:1])[0]) > 0
 
 
+@pytest.mark.long
 def test_planned_paths_are_free_and_pushed_ones_cause_contacts() -> None:
     trials = try_paths(2, gaussians=6000, budget_ms=60.0)
     assert trials.planned == trials.certified == 2

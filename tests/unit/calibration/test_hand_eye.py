@@ -179,6 +179,7 @@ def test_offsets_that_trade_off_are_covered_by_their_standard_deviations() -> No
     assert (np.abs(pose_error(found.T_link_moving, X)) < 3 * found.sigma_moving).all()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("error", [0.0002, 0.005])
 def test_standard_deviations_of_boards_cover_the_errors_of_a_good_and_of_a_bad_arm(error: float) -> None:
     """NEES of X, six degrees of freedom on average, for arms that err by 0.2 and 5 mm and milliradians."""

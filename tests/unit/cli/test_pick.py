@@ -39,6 +39,7 @@ def test_a_can_is_taken_and_the_twin_says_how_far_it_rose(run: RunCommand, scene
     assert abs(written["rose_m"]["slab"]) < 0.002
 
 
+@pytest.mark.long
 def test_a_can_that_was_pushed_aside_after_the_scan_is_looked_for_and_taken(
     run: RunCommand, scene: Path, tmp_path: Path
 ) -> None:

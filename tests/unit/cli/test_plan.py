@@ -141,6 +141,7 @@ def test_a_base_that_stands_in_the_map_is_reported(run: RunCommand, map_file: Pa
     assert "more of the mounted link than its foot is in the map; check --base" in answer.out
 
 
+@pytest.mark.long
 def test_a_map_with_harmonics_and_a_support_plane_is_planned_in_and_drawn(run: RunCommand, tmp_path: Path) -> None:
     model = tabletop().gaussians(4000)
     replace(model, sh=model.sh.repeat(1, 16, 1) * 0.1).save(tmp_path / "map.ply")

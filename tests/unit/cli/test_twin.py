@@ -46,6 +46,7 @@ def test_an_arm_that_touches_the_map_ends_with_1(run: RunCommand, tmp_path: Path
     assert "Gaussians as" in answer.out
 
 
+@pytest.mark.long
 def test_a_plan_of_another_robot_at_another_base_runs_in_the_twin_of_the_map(run: RunCommand, tmp_path: Path) -> None:
     tabletop().gaussians(4000).save(tmp_path / "map.ply")
     of = ("--map", tmp_path / "map.ply", "--robot", "ur5e-2f85", "--base", 0.05, 0, 0, 1, 0, 0, 0)

@@ -42,6 +42,7 @@ def _mixture(n: int, rng: np.random.Generator) -> GaussianModel:
     return model
 
 
+@pytest.mark.long
 def test_packed_distances_never_exceed_those_of_the_ellipsoids_and_stay_within_the_stated_share(isa: str) -> None:
     rng = np.random.default_rng(0)
     model = _mixture(400, rng)

@@ -22,6 +22,7 @@ def test_the_scale_is_that_of_the_initial_poses(rng: np.random.Generator) -> Non
     assert umeyama_scale(positions, 2.5 * turned + 4.0) == pytest.approx(2.5)
 
 
+@pytest.mark.long
 def test_poses_of_rendered_images_are_found_from_worse_ones(tmp_path: Path, rng: np.random.Generator) -> None:
     log = open_log("synthetic:tabletop?trajectory=arm&frames=12&seed=1")
     assert log.ground_truth is not None

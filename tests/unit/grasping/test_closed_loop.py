@@ -48,6 +48,7 @@ def pick(world: Twin, name: str, *, look: bool, options: PickOptions = OPTIONS) 
     return picker.pick(target(name), grasps=grasps(name)), controller
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "x", "y", "degrees"), [("can", 0.03, 0.02, 0.0), ("carton", 0.02, 0.02, 0.0), ("ball", 0.03, -0.02, 0.0)]
 )

@@ -62,6 +62,7 @@ def test_the_largest_gradients_beyond_the_limit_are_chosen_up_to_the_cap_for_any
     assert gradients.largest(1.2, 9).tolist() == [0, 3]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("cap", [150_000, 5_000])
 def test_a_finished_map_is_denser_where_its_pictures_are_not_met_and_under_its_cap(cap: int) -> None:
     log = open_log("synthetic:tabletop?frames=6&width=160&height=120&trajectory=orbit&rate=3")

@@ -219,6 +219,7 @@ def test_a_pose_of_a_free_camera_moves_with_the_keyframe_that_views_the_same_pla
     assert np.allclose(slam.trajectory_of("head").T_world_camera, before, atol=1e-9)
 
 
+@pytest.mark.long
 def test_a_free_camera_that_sees_another_side_is_never_found_though_it_stands_still() -> None:
     for degrees in (120, 150, 180, 210):
         T = side_view(wrist(), np.radians(degrees), 0.0)
@@ -230,6 +231,7 @@ def test_a_free_camera_that_sees_another_side_is_never_found_though_it_stands_st
         assert all(pose_distance(truth, k.T_world_camera)[0] < 0.02 for k in slam.keyframes if k.camera_name)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("exact", [False, True])
 def test_a_camera_that_was_bumped_is_noticed_and_estimated_again_unless_its_pose_is_exact(exact: bool) -> None:
     log = wrist_log(70, width=160, height=120)

@@ -152,6 +152,7 @@ def gap(slam: Slam, truth: list[Array], closed: int = FRAMES) -> float:
     return worst
 
 
+@pytest.mark.long
 def test_a_circuit_that_drifts_closes_without_a_gap() -> None:
     (open_, truth), (closed, _) = circuit(False), circuit(True)
     assert all(r.verdict == "ok" for r in closed.results)
@@ -170,6 +171,7 @@ def test_a_loop_that_the_last_frame_has_found_is_closed_at_the_end(end: Callable
     assert gap(slam, truth, closed) < 0.6 * before
 
 
+@pytest.mark.long
 def test_a_gap_of_a_centimetre_closes_before_frames_are_aligned_to_both_sides_of_it() -> None:
     size = "width=160&height=120"
     log = open_log(

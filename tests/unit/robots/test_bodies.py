@@ -56,6 +56,7 @@ def test_no_point_of_a_million_on_the_meshes_is_outside_by_another_reader(arm: t
         assert gap.max() <= 0, part
 
 
+@pytest.mark.long
 def test_the_slack_is_at_most_what_the_documentation_states(arm: tuple[Source, Body]) -> None:
     source, body = arm
     medians, most99 = [], []

@@ -86,6 +86,7 @@ def test_its_fingers_lie_in_the_spheres_at_every_opening(boxes: Hand, opening: f
         assert far.min(axis=1).max() <= 0
 
 
+@pytest.mark.long
 def test_frankas_description_of_its_hand_gives_the_hand_that_is_shipped(tmp_path: Path) -> None:
     pytest.importorskip("collada")
     cmeel = pytest.importorskip("cmeel", reason="example-robot-data is not installed")

@@ -78,6 +78,7 @@ def test_its_spheres_cover_its_shapes_and_home_is_free_of_itself(robot: RobotMod
     assert len(robot.self_collision_pairs) >= 15
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["2f85", "2f140"])
 def test_a_hand_on_an_added_arm_is_stored_with_it(tmp_path: Path, name: str) -> None:
     arm = read_urdf(ur5(tmp_path), tip="tool0").robot

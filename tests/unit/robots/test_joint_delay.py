@@ -61,6 +61,7 @@ def test_frames_too_far_apart_determine_no_delay() -> None:
         estimate_joint_delay(static_log(30.0, rate=1.0), panda(), SCENE)
 
 
+@pytest.mark.long
 def test_a_camera_whose_place_is_wrong_and_an_arm_at_rest_determine_no_delay(log: WristLog) -> None:
     moved = T_BASE_STATIC_CAMERA.copy()
     moved[:3, 3] += [0.0, 0.4, 0.3]
@@ -74,6 +75,7 @@ def test_a_camera_whose_place_is_wrong_and_an_arm_at_rest_determine_no_delay(log
         estimate_joint_delay(static_log(0.6), panda(), SCENE)
 
 
+@pytest.mark.long
 def test_the_command_writes_the_delay_that_masks_read(
     log: WristLog, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

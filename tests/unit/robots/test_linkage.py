@@ -88,6 +88,7 @@ def _points(urdf: Path, angle: float, count: int) -> tuple[dict[str, Array], flo
     return found, float(high.min() - low.max())
 
 
+@pytest.mark.long
 def test_no_point_of_a_million_on_the_2f85_is_outside_of_the_spheres_at_any_opening(urdf: Path) -> None:
     robot = load_robot("ur5e-2f85")
     last, T_flange_link = len(robot), inverse(load_robot("ur5e").T_link_tcp)

@@ -44,6 +44,7 @@ def _mesh_arm(folder: Path, unit: float, scale: str = "") -> Path:
     return path
 
 
+@pytest.mark.long
 def test_visual_geometry_is_covered_as_collision_geometry_is(tmp_path: Path) -> None:
     robot = read_description(_mesh_arm(tmp_path, 1.0)).robot
     assert [shape.link for shape in robot.shapes] == [1, 2]

@@ -169,6 +169,7 @@ def test_masks_mark_each_object_that_may_be_picked() -> None:
             assert not any((one.mask & two.mask).any() for two in same)
 
 
+@pytest.mark.long
 def test_a_camera_that_is_not_calibrated_errs_the_same_way_in_each_frame(monkeypatch: pytest.MonkeyPatch) -> None:
     """The mean of the errors of many frames is the error of calibration; an exact camera has none."""
     priors: dict[bool, list[Array]] = {True: [], False: []}

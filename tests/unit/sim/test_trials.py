@@ -273,6 +273,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.long
 def test_workers_end_when_the_process_that_began_them_is_killed(tmp_path: Path) -> None:
     script = tmp_path / "pool.py"
     script.write_text(_POOL)

@@ -156,6 +156,7 @@ def test_depth_is_that_of_the_scene_along_the_optical_axis() -> None:
     assert float(measured) == pytest.approx(float(true), abs=1e-3)
 
 
+@pytest.mark.long
 def test_the_sensors_effects_are_on_the_account_and_change_the_depth() -> None:
     ideal, *_ = _run("[]").split()
     noisy, _, *names = _run('["depth_noise:strength=5"]').split()

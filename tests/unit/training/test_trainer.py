@@ -85,6 +85,7 @@ def test_a_restored_trainer_takes_the_same_steps_bit_for_bit(strategy: str) -> N
     assert torch.equal(whole.poses.viewmats, second.poses.viewmats)
 
 
+@pytest.mark.long
 def test_refined_poses_make_up_for_disturbed_ones() -> None:
     rng = np.random.default_rng(2)
 
