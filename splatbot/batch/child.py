@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import runpy
-import sys
 import threading
 
 INTERRUPTED = 130
@@ -13,7 +12,7 @@ INTERRUPTED = 130
 
 def _end_with_supervisor() -> None:
     """Wait until no process holds the other end of stdin, which is also so after SIGKILL, and exit."""
-    while os.read(sys.__stdin__.fileno(), 1):  # type: ignore[union-attr]
+    while os.read(0, 1):
         pass
     os._exit(INTERRUPTED)
 

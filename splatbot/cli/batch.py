@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from splatbot.cli.messages import print_message
 from splatbot.cli.paths import check_output
 from splatbot.errors import InputError
 from splatbot.layouts import is_camera, log_kind
@@ -95,13 +96,15 @@ def batch(
                 states["finished" if record.finished else "failed"] += 1
                 tell(f"{states.total()} of {len(items)} items", states.total() / len(items))
                 if not quiet:
-                    print(f"{item.name}: {record.error or f'finished, {record.seconds:.1f} s'}", file=sys.stderr)
+                    print_message(item.name, record.error or f"finished, {record.seconds:.1f} s")
 
             interrupted = bool(pending) and run_batch(pending, folder, pool, on_end=show)
         rows = batch_rows(items, folder)
         write_report(rows, folder, interrupted=interrupted)
     if not quiet:
         _print(rows, folder)
+    if interrupted:
+        print("interrupted; the same command continues", file=sys.stderr)
     return 130 if interrupted else int(states["finished"] < len(items))
 
 
