@@ -86,7 +86,7 @@ def compare(
 def _compared(
     model_a: GaussianModel, model_b: GaussianModel, a: Path, b: Path, count: int, log: str | None
 ) -> tuple[list[ComparedView], list[str]]:
-    """Return the compared views, and what could not be used."""
+    """Return the compared views, and notes on recordings that cannot be read."""
     from splatbot.cli.map_views import recorded_views
     from splatbot.training.comparison import compare_around, compare_recorded
 

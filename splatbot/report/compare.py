@@ -90,7 +90,7 @@ def compare_html(
 
 
 def comparison_rows(a: PageMap, b: PageMap, means: Mapping[str, float | None]) -> list[tuple[str, str, str]]:
-    """Return the table of two maps: what is measured, and its values for A and for B."""
+    """Return the table of two maps: a name, and the values of A and of B."""
     rows = [
         ("map", a.name, b.name),
         ("Gaussians", count(a.gaussians), count(b.gaussians)),

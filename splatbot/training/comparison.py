@@ -65,9 +65,10 @@ class ComparedView:
         name: of the view.
         a, b: the maps.
         recorded: (H, W, 3); None if the view is not recorded.
-        scores: figures by name: ``psnr_db`` and ``ssim`` of B against A; ``psnr_a_db``, ``ssim_a``, ``psnr_b_db`` and
-            ``ssim_b`` against the recorded image, if there is one; ``covered_a``, ``covered_b`` and ``overlap``
-            in 0..1; ``depth_difference``, the median share of the depth where both have depth.
+        scores: figures by name. ``psnr_db`` and ``ssim`` are those of B against A. ``psnr_a_db``, ``ssim_a``,
+            ``psnr_b_db`` and ``ssim_b`` are against the recorded image, if there is one. ``covered_a``, ``covered_b``
+            and ``overlap`` are shares of pixels. ``depth_difference`` is the median share of the depth, where both
+            maps have depth.
     """
 
     name: str

@@ -19,6 +19,8 @@ from splatbot.training.scoring import score_held_out, summary
 
 T = TypeVar("T")
 
+_VISIBLE_SHARE = 0.9  # of the Gaussians; the rest are mostly floaters
+_LEAST_RADIUS = 0.05  # [m]
 _GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))  # [rad]
 
 
@@ -65,16 +67,17 @@ def around(
     Returns:
         Camera and T_world_camera (4, 4) of each view.
     """
-    camera, front = default_view(model, width=width, height=height)
-    opacities = model.opacities.double().numpy()
-    centre = np.average(model.means.double().numpy(), axis=0, weights=opacities)
-    distance = float(np.linalg.norm(centre - front[:3, 3]))
+    camera, _ = default_view(model, width=width, height=height)
+    means = model.means.double().numpy()
+    centre = np.average(means, axis=0, weights=model.opacities.double().numpy())
+    radius = np.quantile(np.linalg.norm(means - centre, axis=1), _VISIBLE_SHARE)
+    distance = max(float(radius), _LEAST_RADIUS) * np.hypot(1.0, 2.0 * camera.fy / height)  # the ball fills the height
     heights = 1.0 - 2.0 * (np.arange(count) + 0.5) / count
     angles = _GOLDEN_ANGLE * np.arange(count)
     radii = np.sqrt(1.0 - heights**2)
     views = []
     for z in np.stack([radii * np.sin(angles), heights, radii * np.cos(angles)], axis=1):
-        x = np.cross((0.0, 1.0, 0.0), z)
+        x = np.cross((0.0, 1.0, 0.0), z)  # level, as y points down in maps
         x /= np.linalg.norm(x)
         T = np.eye(4)
         T[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)

@@ -59,6 +59,8 @@ _WORDS = {
     "grasp": ["grasp", "--map", "{run}", "--target", "largest object", "--hand-only", "--out", "{out}/grasp"],
     "objects": ["objects", "{run}"],
     "export": ["export", "{run}", "--format", "points", "octomap", "--voxel", "0.05", "--out", "{out}/export"],
+    "compact": ["compact", "{run}", "--sweep"],
+    "compare": ["compare", "{run}", "{run}/map.ply", "--views", "1", "--out", "{out}/compare.html"],
     "robot list": ["robot", "list"],
     "robot info": ["robot", "info", "panda"],
     "twin --list": ["twin", "--list"],
