@@ -124,6 +124,16 @@ class BagLog(StampedLog):
         poses = self._checked(TRUTH, lambda: np.stack([pose_of(m.pose) for m in messages]))
         return Trajectory(np.array([seconds_of(m.header.stamp) for m in messages]), poses)
 
+    def accelerations(self) -> dict[str, NDArray[np.float64]]:
+        """Return stamps [s] and specific forces [m/s²] (N, 4) of each topic of sensor_msgs/Imu that has them."""
+        topics = sorted({c.topic for c in self._reader.connections if c.msgtype == "sensor_msgs/msg/Imu"})
+        found = {}
+        for topic in topics:
+            measured = [m for m in self._all(topic) if m.linear_acceleration_covariance[0] != -1]  # -1: not measured
+            vectors = [(m.header.stamp, m.linear_acceleration) for m in measured]
+            found[topic] = np.array([(seconds_of(stamp), a.x, a.y, a.z) for stamp, a in vectors]).reshape(-1, 4)
+        return found
+
     @property
     def has_transforms(self) -> bool:
         """Return whether the recording has messages of TF."""

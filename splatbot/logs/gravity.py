@@ -1,4 +1,7 @@
-"""Up direction from the accelerometer of a log (`accelerometer.txt` of TUM recordings: stamp ax ay az)."""
+"""Up direction from the accelerometer of a log.
+
+TUM recordings have `accelerometer.txt` (stamp ax ay az), recordings of ROS topics have messages of sensor_msgs/Imu.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatbot.errors import LogError
+from splatbot.layouts import log_kind
+from splatbot.logs.address import split_address
 from splatbot.trajectory import Trajectory
 
 NAME = "accelerometer.txt"
@@ -45,21 +50,15 @@ def measured_up(uri: str, trajectory: Trajectory) -> tuple[float, float, float] 
     the answer is None.
 
     Args:
-        uri: folder of the log.
+        uri: address of the log.
         trajectory: poses T_world_camera of the log's frames.
 
     Raises:
         LogError: the file is damaged.
     """
-    path = Path(uri) / NAME
-    if not path.is_file() or len(trajectory) < CONSTANTS.min_poses:
+    rows = _accelerations(uri)
+    if rows is None or len(trajectory) < CONSTANTS.min_poses:
         return None
-    try:
-        rows = np.loadtxt(path, comments="#", ndmin=2)
-    except ValueError as error:
-        raise LogError(f"is no list of numbers ({error}).", file=path, hint="write: stamp ax ay az") from error
-    if rows.shape[1] < 4:
-        raise LogError(f"has {rows.shape[1]} columns.", file=path, hint="write: stamp ax ay az")
     steady = [(T[:3, :3], mean) for stamp, T in _poses(trajectory) if (mean := _mean_around(rows, stamp)) is not None]
     if len(steady) < CONSTANTS.min_poses:
         return None
@@ -71,6 +70,33 @@ def measured_up(uri: str, trajectory: Trajectory) -> tuple[float, float, float] 
         return None
     x, y, z = best[1].tolist()
     return (x, y, z)
+
+
+def _accelerations(uri: str) -> NDArray[np.float64] | None:
+    """Return stamps and specific forces (N, 4), or None if the log has none."""
+    path = Path(uri) / NAME
+    if path.is_file():
+        return _read_text(path)
+    if not Path(uri.partition("?")[0]).exists() or log_kind(uri) != "bag":
+        return None
+    from splatbot.logs.bag import KEYS, BagLog  # rosbags builds its message classes when imported
+
+    place, options = split_address(uri, KEYS)
+    low, high = CONSTANTS.gravity
+    # A topic of a gyroscope has zeros; a camera that hardly accelerates measures gravity.
+    topics = BagLog(place, options=options).accelerations().values()
+    still = [rows for rows in topics if len(rows) and low < np.median(np.linalg.norm(rows[:, 1:], axis=1)) < high]
+    return max(still, key=len, default=None)
+
+
+def _read_text(path: Path) -> NDArray[np.float64]:
+    try:
+        rows = np.loadtxt(path, comments="#", ndmin=2)
+    except ValueError as error:
+        raise LogError(f"is no list of numbers ({error}).", file=path, hint="write: stamp ax ay az") from error
+    if rows.shape[1] < 4:
+        raise LogError(f"has {rows.shape[1]} columns.", file=path, hint="write: stamp ax ay az")
+    return np.asarray(rows[:, :4])
 
 
 def _poses(trajectory: Trajectory) -> list[tuple[float, NDArray[np.float64]]]:

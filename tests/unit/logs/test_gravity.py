@@ -1,11 +1,15 @@
-"""Up direction from an accelerometer whose axes on the camera are not recorded."""
+"""Up direction from an accelerometer whose axes on the camera are not recorded: TUM text and ROS messages."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
+from rosbags.rosbag2 import Writer
+from rosbags.typesys import Stores, get_typestore
 
 from splatbot.errors import LogError
 from splatbot.geometry import so3_exp
@@ -33,6 +37,49 @@ def _log(folder: Path, swing: float, noise: float = 0.05) -> Trajectory:
 
 def test_the_direction_is_found_although_the_axes_are_unknown(tmp_path: Path) -> None:
     found = measured_up(str(tmp_path), _log(tmp_path, 0.5))
+    assert found is not None
+    assert np.degrees(np.arccos(np.clip(np.dot(found, _UP), -1, 1))) < 1.0
+
+
+def test_imu_topics_of_a_recording_give_it_and_those_of_a_gyroscope_do_not(tmp_path: Path) -> None:
+    store = get_typestore(Stores.ROS2_HUMBLE)  # an independent writer
+    types = store.types
+    trajectory = _log(tmp_path, 0.5)
+    stamps, *force = np.loadtxt(tmp_path / NAME).T
+    color = np.zeros((12, 16, 3), np.uint8)
+    with Writer(tmp_path / "bag", version=9) as writer:
+
+        def add(topic: str, kind: str, stamp: float, **values: object) -> None:
+            connection = known.get(topic) or known.setdefault(
+                topic, writer.add_connection(topic, kind, typestore=store)
+            )
+            seconds = int(stamp)
+            time = types["builtin_interfaces/msg/Time"](seconds, round((stamp - seconds) * 1e9))
+            header = types["std_msgs/msg/Header"](time, "camera")
+            message = types[kind](header=header, **values)
+            writer.write(connection, round(stamp * 1e9), store.serialize_cdr(message, kind))
+
+        def image(encoding: str, pixels: NDArray[Any], step: int) -> dict[str, object]:
+            values = {"height": 12, "width": 16, "encoding": encoding, "is_bigendian": 0, "step": step}
+            return values | {"data": pixels.view(np.uint8).ravel()}
+
+        known: dict[str, Any] = {}
+        vector, none = types["geometry_msgs/msg/Vector3"], np.zeros(9)
+        q = types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
+        for stamp, *a in zip(stamps.tolist(), *(f.tolist() for f in force), strict=True):
+            imu = {"orientation": q, "orientation_covariance": none, "angular_velocity": vector(0.1, 0.0, 0.0)}
+            imu |= {"angular_velocity_covariance": none, "linear_acceleration_covariance": none}
+            add("/accel", "sensor_msgs/msg/Imu", stamp, linear_acceleration=vector(*a), **imu)
+            add("/gyro", "sensor_msgs/msg/Imu", stamp, linear_acceleration=vector(0.0, 0.0, 0.0), **imu)
+            add("/camera/color/image_raw", "sensor_msgs/msg/Image", stamp, **image("rgb8", color, 48))
+            depth = np.ones((12, 16), np.float32)
+            add("/camera/depth/image_rect_raw", "sensor_msgs/msg/Image", stamp, **image("32FC1", depth, 64))
+            roi = types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
+            K = np.array([20.0, 0, 8, 0, 20, 6, 0, 0, 1])
+            info = {"height": 12, "width": 16, "distortion_model": "plumb_bob", "d": np.zeros(5), "k": K}
+            info |= {"r": np.eye(3).ravel(), "p": np.zeros(12), "binning_x": 0, "binning_y": 0, "roi": roi}
+            add("/camera/color/camera_info", "sensor_msgs/msg/CameraInfo", stamp, **info)
+    found = measured_up(str(tmp_path / "bag"), trajectory)
     assert found is not None
     assert np.degrees(np.arccos(np.clip(np.dot(found, _UP), -1, 1))) < 1.0
 
