@@ -38,6 +38,7 @@ _WORDS = {
     "info": ["info", "{run}"],
     "info of a log": ["info", LOG],
     "train": ["train", "{run}", "--iterations", "60", "--out", "{out}/trained"],
+    "batch": ["batch", "simulate", "tabletop", "--with", "frames", "2", "--with", "size", "80x60", "--out", "{out}/batch"],
     "simulate": ["simulate", "tabletop", "--frames", "3", "--size", "80x60", "--out", "{out}/log"],
     "simulate --list": ["simulate", "--list"],
     "record": ["record", LOG, "--out", "{out}/a.mcap"],
