@@ -49,15 +49,14 @@ def test_imu_topics_of_a_recording_give_it_and_those_of_a_gyroscope_do_not(tmp_p
     color = np.zeros((12, 16, 3), np.uint8)
     with Writer(tmp_path / "bag", version=9) as writer:
 
-        def add(topic: str, kind: str, stamp: float, **values: object) -> None:
-            connection = known.get(topic) or known.setdefault(
-                topic, writer.add_connection(topic, kind, typestore=store)
-            )
+        def add(topic: str, kind: str, stamp: float, **values: Any) -> None:
+            if topic not in known:
+                known[topic] = writer.add_connection(topic, kind, typestore=store)
             seconds = int(stamp)
             time = types["builtin_interfaces/msg/Time"](seconds, round((stamp - seconds) * 1e9))
             header = types["std_msgs/msg/Header"](time, "camera")
             message = types[kind](header=header, **values)
-            writer.write(connection, round(stamp * 1e9), store.serialize_cdr(message, kind))
+            writer.write(known[topic], round(stamp * 1e9), store.serialize_cdr(message, kind))
 
         def image(encoding: str, pixels: NDArray[Any], step: int) -> dict[str, object]:
             values = {"height": 12, "width": 16, "encoding": encoding, "is_bigendian": 0, "step": step}
@@ -94,4 +93,5 @@ def test_without_an_accelerometer_there_is_no_answer_and_a_damaged_file_is_named
     with pytest.raises(LogError, match="accelerometer"):
         measured_up(str(tmp_path), trajectory)
     (tmp_path / NAME).unlink()
+    (tmp_path / "rgb.txt").touch()
     assert measured_up(str(tmp_path), trajectory) is None
