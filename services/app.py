@@ -56,7 +56,13 @@ def create_app(runtime: Runtime) -> FastAPI:
     settings = runtime.settings
     access = Access(settings)
     integrations = Integrations(
-        settings, access, runtime.store, runtime.arms, on_frame=runtime.take, on_joints=runtime.report_joints
+        settings,
+        access,
+        runtime.store,
+        runtime.arms,
+        on_frame=runtime.take,
+        on_joints=runtime.report_joints,
+        find_transform=runtime.find_transform,
     )
 
     @asynccontextmanager

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from splatbot.frame import Frame
+from splatbot.logs.ros_cameras import FindTransform
 from splatbot.services.access import Access
 from splatbot.services.arms import Arms
 from splatbot.services.ros.node import RosNode
@@ -27,6 +28,7 @@ class Integrations:
         arms: executes the motions that ROS clients send.
         on_frame: called with each frame that ROS clients publish.
         on_joints: called with the robot's name and its joints that ROS clients publish.
+        find_transform: of the TF that ROS clients publish.
 
     Raises:
         InputError: the viewer's port is taken.
@@ -42,6 +44,7 @@ class Integrations:
         *,
         on_frame: Callable[[Frame], Any],
         on_joints: Callable[[str, JointState], Any],
+        find_transform: FindTransform,
     ) -> None:
         self.ros = RosNode(
             store,
@@ -50,6 +53,7 @@ class Integrations:
             on_frame=on_frame,
             on_joints=on_joints,
             max_pixels=settings.max_pixels,
+            find_transform=find_transform,
         )
         router = settings.zenoh_router
         self._zenoh = ZenohBridge(self.ros.graph, router, domain=settings.ros_domain) if router is not None else None

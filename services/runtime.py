@@ -15,7 +15,7 @@ from splatbot.config import Config
 from splatbot.errors import ConfigError, InputError, MapNotFoundError, SplatbotError
 from splatbot.frame import Frame
 from splatbot.logs import Log
-from splatbot.protocols import FrameSource
+from splatbot.protocols import Array, FrameSource
 from splatbot.rasterize.native import native
 from splatbot.robots.robot import RobotModel
 from splatbot.services.arms import Arms, known_robot
@@ -267,6 +267,10 @@ class Runtime:
         if problem is not None and not kept:
             raise problem
         return kept
+
+    def find_transform(self, target: str, source: str) -> Array | None:
+        """Return the newest T_target_source (4, 4) [m] of clients' TF; None if nothing connects the frames."""
+        return self._robot_topics.transforms.newest(target, source)
 
     def _take_robot_news(self) -> None:
         for news in self._robot_news:

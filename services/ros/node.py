@@ -7,6 +7,7 @@ from functools import partial
 from typing import Any
 
 from splatbot.frame import Frame
+from splatbot.logs.ros_cameras import FindTransform
 from splatbot.logs.ros_types import Message
 from splatbot.services.arms import Arms
 from splatbot.services.ros.emergency import EmergencyStopTopic
@@ -33,6 +34,7 @@ class RosNode:
         on_frame: called with each frame that clients publish. If None, frames are not mapped.
         on_joints: called with the robot's name and its joints that clients publish. If None, the bus receives them.
         max_pixels: of an image that clients publish.
+        find_transform: of TF, for depth of another camera than colour.
     """
 
     def __init__(
@@ -44,6 +46,7 @@ class RosNode:
         on_frame: Callable[[Frame], Any] | None = None,
         on_joints: Callable[[str, JointState], Any] | None = None,
         max_pixels: int = MAX_PIXELS,
+        find_transform: FindTransform = lambda target, source: None,
     ) -> None:
         self.graph = RosGraph()
         RosApi(self.graph)
@@ -62,7 +65,14 @@ class RosNode:
         self._parts: list[TfRepublisher | RosPublishers | RosSubscribers | FollowJointTrajectory] = [
             TfRepublisher(self.graph),
             RosPublishers(store.bus, self.graph),
-            RosSubscribers(self.graph, take_joints, publish_robot, on_frame=on_frame, max_pixels=max_pixels),
+            RosSubscribers(
+                self.graph,
+                take_joints,
+                publish_robot,
+                on_frame=on_frame,
+                max_pixels=max_pixels,
+                find_transform=find_transform,
+            ),
         ]
         if follow is not None:
             self._parts.append(follow)

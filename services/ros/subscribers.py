@@ -8,14 +8,13 @@ from collections import OrderedDict
 from collections.abc import Callable
 from typing import Any
 
-from splatbot.camera import Camera
 from splatbot.errors import SplatbotError
 from splatbot.frame import Frame
 from splatbot.logs.index import MAX_STAMP_DIFFERENCE_S
 from splatbot.logs.mcap import COLOR, DEPTH, INFO, JOINTS
+from splatbot.logs.ros_cameras import FindTransform, RosCameras
 from splatbot.logs.ros_frames import RosFrame, camera_of, color_of, depth_of, seconds_of, size_of
 from splatbot.logs.ros_types import Message
-from splatbot.logs.undistort import Undistorter
 from splatbot.services.bus import Subscription
 from splatbot.services.problems import BusyError, TooLargeError
 from splatbot.services.ros.graph import RosGraph
@@ -27,6 +26,8 @@ from splatbot.services.ros.wire import RosMessage
 from splatbot.services.threads import join_started
 from splatbot.services.topics import JointState
 
+DEPTH_INFO = "/camera/depth/camera_info"
+"""Intrinsics of depth, where it is of another camera than colour."""
 MAX_PIXELS = 2_100_000  # of an image, unless the settings of the service say otherwise
 _WAITING = 16
 _WAITING_STATES = 2000  # 2 s of a robot at 1 kHz, while an image is decoded; also of its transforms
@@ -38,7 +39,7 @@ class RosSubscribers:
     """Three threads: one builds frames from clients' images, the others take joint states, and TF with MoveIt's topics.
 
     A frame is a colour image, the depth image nearest in time (within 0.02 s) and the latest CameraInfo. Unusable
-    messages are logged, which also reaches /rosout.
+    messages are logged, which also reaches /rosout. Depth of another camera than colour has a CameraInfo of its own.
 
     Args:
         graph: where clients publish.
@@ -46,6 +47,7 @@ class RosSubscribers:
         on_robot: called with the topic and each message of TF and of attached objects.
         on_frame: called with each frame. If None, images are only forwarded to other clients.
         max_pixels: of an image.
+        find_transform: of TF, for depth of another camera than colour.
     """
 
     def __init__(
@@ -56,15 +58,17 @@ class RosSubscribers:
         *,
         on_frame: Callable[[Frame], Any] | None = None,
         max_pixels: int = MAX_PIXELS,
+        find_transform: FindTransform = lambda target, source: None,
     ) -> None:
         self._on_joints, self._on_robot, self._on_frame = on_joints, on_robot, on_frame
         self.dropped = 0
-        self._pairs = FramePairs(max_pixels)
+        self._pairs = FramePairs(max_pixels, find_transform)
         register_moveit_types()
+        graph.advertise(DEPTH_INFO, "sensor_msgs/msg/CameraInfo")
         for topic, kind in TYPES_OF_ROBOT.items():
             graph.advertise(topic, kind)
         self._news = (
-            graph.subscribe(COLOR, DEPTH, INFO, capacity=_WAITING),
+            graph.subscribe(COLOR, DEPTH, INFO, DEPTH_INFO, capacity=_WAITING),
             graph.subscribe(JOINTS, capacity=_WAITING_STATES),
             graph.subscribe(*TYPES_OF_ROBOT, capacity=_WAITING_STATES),
         )
@@ -112,12 +116,14 @@ class FramePairs:
 
     Args:
         max_pixels: of an image; larger ones are refused before anything is decoded or allocated.
+        find_transform: of TF, for depth of another camera than colour.
     """
 
-    def __init__(self, max_pixels: int = MAX_PIXELS) -> None:
+    def __init__(
+        self, max_pixels: int = MAX_PIXELS, find_transform: FindTransform = lambda target, source: None
+    ) -> None:
         self._max_pixels = max_pixels
-        self._camera: Camera | None = None
-        self._undistort: Undistorter | None = None
+        self._cameras = RosCameras(find_transform)
         self._waiting: dict[str, OrderedDict[float, Any]] = {COLOR: OrderedDict(), DEPTH: OrderedDict()}
         self._count = 0
 
@@ -128,18 +134,19 @@ class FramePairs:
             InputError: the image or the intrinsics make no sense, or do not belong together.
             TooLargeError: the image has too many pixels.
         """
-        if topic == INFO:
+        if topic in (INFO, DEPTH_INFO):
             camera = camera_of(message)
             self._check_size(camera.width, camera.height)
             camera.check_plausible()
-            if self._undistort is None or camera != self._camera:
-                self._undistort = Undistorter(camera) if camera.distortion else None
-            self._camera = camera
+            if topic == INFO:
+                self._cameras.color = camera
+            else:
+                self._cameras.depth = camera
             return None
         self._check_size(*size_of(message))
         stamp, other = seconds_of(message.header.stamp), self._waiting[DEPTH if topic == COLOR else COLOR]
         nearest = min(other, key=lambda known: abs(known - stamp), default=None)
-        if self._camera is None or nearest is None or abs(nearest - stamp) > MAX_STAMP_DIFFERENCE_S:
+        if self._cameras.color is None or nearest is None or abs(nearest - stamp) > MAX_STAMP_DIFFERENCE_S:
             self._waiting[topic][stamp] = message
             while len(self._waiting[topic]) > _WAITING:
                 self._waiting[topic].popitem(last=False)
@@ -156,14 +163,17 @@ class FramePairs:
             )
 
     def _frame(self, stamp: float, color: Any, depth: Any) -> Frame:
-        assert self._camera is not None
-        rgb, z = color_of(color), depth_of(depth)
-        camera = self._camera
-        if self._undistort is not None and rgb.shape[:2] == z.shape == (camera.height, camera.width):
-            rgb, z, camera = self._undistort.color(rgb), self._undistort.depth(z), self._undistort.camera
+        color_frame, depth_frame = (message.header.frame_id.strip("/") for message in (color, depth))
+        pair = self._cameras.pair(color_frame, depth_frame)
+        rgb, z = pair.images(color_of(color), depth_of(depth))
         self._count += 1
-        delay = seconds_of(depth.header.stamp) - stamp
-        frame_id = color.header.frame_id.strip("/")
         return RosFrame(
-            stamp, rgb, z, camera, self._count - 1, source=FROM_ROS, depth_delay=delay, camera_frame=frame_id
+            stamp,
+            rgb,
+            z,
+            pair.camera,
+            self._count - 1,
+            source=FROM_ROS,
+            depth_delay=seconds_of(depth.header.stamp) - stamp,
+            camera_frame=depth_frame or color_frame,
         )

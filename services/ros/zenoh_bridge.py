@@ -16,10 +16,11 @@ from splatbot.logs.mcap import COLOR, DEPTH, INFO, JOINTS
 from splatbot.logs.ros_types import from_cdr, full_name, typestore
 from splatbot.services.ros.graph import RosGraph
 from splatbot.services.ros.robot_topics import TYPES_OF_ROBOT
+from splatbot.services.ros.subscribers import DEPTH_INFO
 from splatbot.services.ros.wire import RosMessage
 from splatbot.services.threads import join_started
 
-HEARD = (COLOR, DEPTH, INFO, JOINTS, *TYPES_OF_ROBOT)  # of the topics that others publish
+HEARD = (COLOR, DEPTH, INFO, DEPTH_INFO, JOINTS, *TYPES_OF_ROBOT)  # of the topics that others publish
 _CLIENT = -1  # identity in the graph
 _NODE, _WAITING = "splatbot", 256
 _VOLATILE, _LATCHED = "::,10:,:,:,,", ":1:,1:,:,:,,"  # quality of service: differences from ROS' defaults

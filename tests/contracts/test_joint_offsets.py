@@ -12,12 +12,15 @@ from splatbot.cli.plan import plan
 from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.gaussians import GaussianModel, Snapshot
 from splatbot.geometry import rotation_to_quat
+from splatbot.logs import open_log
+from splatbot.logs.record import record
 from splatbot.robots.panda import panda
 from splatbot.services.ros.moveit import robot_place
 from splatbot.services.settings import ServiceSettings
 from splatbot.services.store import MapStore
 from splatbot.workspace import Workspace, find_workspace
 from tests.contracts.conftest import running
+from tests.swept_arm import T_BASE_STATIC_CAMERA
 
 OFFSETS = np.array([0.0, 0.03, -0.02, 0.04, 0.01, -0.03, 0.0])
 GOAL = np.array([0.9, -0.3, 0.1, -2.0, 0.2, 1.8, 0.5])  # true positions
@@ -53,3 +56,27 @@ def test_the_true_arm_reaches_a_pose_and_is_free_although_the_plan_is_in_reporte
     np.testing.assert_allclose(checked["clearance"], true, atol=1e-9)
     np.testing.assert_allclose(panda().tcp(np.array(ik["q"][0]) + OFFSETS), tool, atol=1e-4)
     np.testing.assert_allclose(robot_place(store, "panda")[1].fk(GOAL - OFFSETS), panda().fk(GOAL), atol=1e-12)
+
+
+def test_a_map_keeps_the_offsets_of_its_request_or_of_its_recording_with_any_base(tmp_path: Path) -> None:
+    base = {"translation": [0.0, 0.5, 0.0], "quaternion_wxyz": [1.0, 0.0, 0.0, 0.0]}
+    at = T_BASE_STATIC_CAMERA
+    mount = {"translation": at[:3, 3].tolist(), "quaternion_wxyz": rotation_to_quat(at[:3, :3]).tolist()}
+    robot = {"name": "panda", "T_link_camera": mount, "camera_link": 0, "joint_offsets": OFFSETS.tolist()}
+    record(open_log("synthetic:tabletop?frames=2&width=64&height=48"), tmp_path / "desk")
+    Workspace(T_world_base=np.eye(4), joint_offsets=2 * OFFSETS).save(tmp_path / "desk" / "scene.yaml")
+    with running(ServiceSettings(port=0, log_roots=(str(tmp_path),))) as service:
+        for body in (
+            {"id": "pushed", "robot": robot, "robot_base": base},
+            {"id": "desk", "log": "desk", "robot_base": base},
+            {"id": "both", "log": "desk", "robot": robot},
+        ):
+            assert service.client.post("/v1/maps", json=body).status_code in (201, 202)
+        found = {name: service.store.get(name).workspace for name in ("pushed", "desk", "both")}
+    for name, (share, y) in {"pushed": (1, 0.5), "desk": (2, 0.5), "both": (1, 0.0)}.items():
+        scene = found[name]
+        assert scene is not None
+        assert scene.T_world_base is not None
+        assert scene.joint_offsets is not None
+        assert scene.T_world_base[1, 3] == y
+        np.testing.assert_allclose(scene.joint_offsets, share * OFFSETS)

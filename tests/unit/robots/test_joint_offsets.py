@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -14,6 +15,7 @@ from splatbot.planning import MotionRefusedError, time_path
 from splatbot.protocols import Array
 from splatbot.robots.appearance import appearance
 from splatbot.robots.joint_offsets import robot_in_scene
+from splatbot.robots.mjcf import to_mjcf
 from splatbot.robots.panda import panda
 from splatbot.robots.robot import RobotModel
 from splatbot.robots.store import load_robot
@@ -49,6 +51,14 @@ def test_its_links_are_where_the_manufacturers_model_has_them_at_the_true_positi
     spheres, plain = RobotSpheres(found).forward(q[0]), RobotSpheres(robot).forward(q[0] + OFFSETS)
     np.testing.assert_allclose(spheres[0], plain[0], atol=1e-9)
     np.testing.assert_array_equal(found.self_collision_pairs, robot.self_collision_pairs)
+
+
+def test_mujoco_moves_its_twin_by_reported_positions_to_the_true_poses() -> None:
+    model = mujoco.MjModel.from_xml_string(to_mjcf(robot_in_scene(panda(), SCENE)))
+    data = mujoco.MjData(model)
+    data.qpos[:7] = panda().home
+    mujoco.mj_kinematics(model, data)
+    np.testing.assert_allclose(data.site("tcp").xpos, panda().tcp(panda().home + OFFSETS)[:3, 3], atol=1e-9)
 
 
 def test_it_looks_like_the_robot() -> None:

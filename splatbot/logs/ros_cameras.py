@@ -1,0 +1,107 @@
+"""Colour and depth of ROS topics as images of one undistorted camera, whether one camera or two record them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from splatbot.camera import Camera
+from splatbot.errors import InputError
+from splatbot.logs.registration import ColorRegistration
+from splatbot.logs.undistort import Undistorter
+from splatbot.protocols import Array
+
+FindTransform = Callable[[str, str], Array | None]
+"""Returns T_target_source (4, 4) [m] of two frames of TF, or None if nothing connects them."""
+
+
+class CameraPair:
+    """Removes the distortion of colour and depth, and puts colour of another camera at the pixels of depth.
+
+    Args:
+        color: colour camera.
+        depth: depth camera. If it equals the colour camera at the same place, images stay at their pixels.
+        T_color_depth: (4, 4), points of the depth camera to those of the colour camera [m].
+
+    Raises:
+        CameraError: an image is too large.
+
+    Attributes:
+        camera: undistorted camera of the images: that of depth.
+    """
+
+    def __init__(self, color: Camera, depth: Camera, T_color_depth: ArrayLike) -> None:
+        self.color, self.depth, self.T_color_depth = color, depth, np.asarray(T_color_depth, np.float64)
+        self._lens_of_color = Undistorter(color) if color.distortion else None
+        self._lens_of_depth = Undistorter(depth) if depth.distortion else None
+        straight = self._lens_of_color.camera if self._lens_of_color else color
+        self.camera = self._lens_of_depth.camera if self._lens_of_depth else depth
+        one = color == depth and np.array_equal(self.T_color_depth, np.eye(4))
+        self._registration = None if one else ColorRegistration(straight, self.camera, self.T_color_depth)
+
+    def images(
+        self, rgb: NDArray[np.uint8], depth: NDArray[np.float32]
+    ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+        """Return colour (H, W, 3) and depth (H, W) [m] at the pixels of ``camera``.
+
+        Raises:
+            InputError: an image is not of its camera's size.
+        """
+        for name, shape, camera in (("colour", rgb.shape, self.color), ("depth", depth.shape, self.depth)):
+            if shape[:2] != (camera.height, camera.width):
+                size = f"{shape[1]}x{shape[0]}, its camera_info {camera.width}x{camera.height}"
+                hint = "publish the camera_info of these images; depth of another camera than colour has its own"
+                raise InputError(f"is {size}.", field=f"{name} image", hint=hint)
+        if self._lens_of_color is not None:
+            rgb = self._lens_of_color.color(rgb)
+        if self._lens_of_depth is not None:
+            depth = self._lens_of_depth.depth(depth)
+        return (rgb, depth) if self._registration is None else self._registration.register(rgb, depth, "frame")
+
+
+class RosCameras:
+    """The cameras of colour and depth as their messages describe them, which may change.
+
+    Args:
+        find_transform: of TF, between the frames of two cameras.
+    """
+
+    def __init__(self, find_transform: FindTransform) -> None:
+        self.color: Camera | None = None
+        self.depth: Camera | None = None
+        self._find_transform = find_transform
+        self._pair: CameraPair | None = None
+
+    def pair(self, color_frame: str, depth_frame: str) -> CameraPair:
+        """Return the pair for images whose headers name frames of TF; the colour camera is known.
+
+        Depth is of the colour camera if it names the same frame, or none, and has no other intrinsics.
+
+        Raises:
+            InputError: depth is of another camera, and its intrinsics or its place are not known.
+            CameraError: an image is too large.
+        """
+        assert self.color is not None  # of the caller
+        depth, T = self.depth or self.color, np.eye(4)
+        if color_frame and depth_frame and color_frame != depth_frame:
+            where = f"is of {depth_frame}, colour of {color_frame}"
+            if self.depth is None:
+                hint = (
+                    "publish camera_info of depth and TF between both, or depth registered to colour with its frame_id"
+                )
+                raise InputError(f"{where}, and depth has no camera_info.", field="depth", hint=hint)
+            found = self._find_transform(color_frame, depth_frame)
+            if found is None:
+                hint = "publish it on /tf_static, or depth that is registered to colour with its frame_id"
+                raise InputError(f"{where}, and TF does not connect them.", field="depth", hint=hint)
+            T = found
+        known = self._pair
+        if (
+            known is None
+            or (known.color, known.depth) != (self.color, depth)
+            or not np.array_equal(known.T_color_depth, T)
+        ):
+            known = self._pair = CameraPair(self.color, depth, T)
+        return known
