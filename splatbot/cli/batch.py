@@ -19,7 +19,8 @@ from splatbot.layouts import is_camera, log_kind
 if TYPE_CHECKING:
     from splatbot.batch.item import BatchItem, ItemRecord
 
-_OF_PATHS = ("train", "export", "sim2real")  # commands whose input is a path
+_OF_LOGS = ("map", "sim2real")  # commands whose input is a log
+_OF_PATHS = ("train", "export")  # commands whose input is a path
 
 
 def batch(
@@ -92,12 +93,16 @@ def batch(
         states = Counter(finished=len(items) - len(pending))
         with shares(quiet) as tell:
 
+            def show_state() -> None:
+                tell(f"{states.total()} of {len(items)} items", states.total() / len(items))
+
             def show(item: BatchItem, record: ItemRecord) -> None:
                 states["finished" if record.finished else "failed"] += 1
-                tell(f"{states.total()} of {len(items)} items", states.total() / len(items))
+                show_state()
                 if not quiet:
                     print_message(item.name, record.error or f"finished, {record.seconds:.1f} s")
 
+            show_state()
             interrupted = bool(pending) and run_batch(pending, folder, pool, on_end=show)
         rows = batch_rows(items, folder)
         write_report(rows, folder, interrupted=interrupted)
@@ -142,9 +147,9 @@ def _check_items(command: str, inputs: Sequence[str], items: Sequence[BatchItem]
 
 
 def _check_input(command: str, text: str) -> None:
-    if command == "map":
+    if command in _OF_LOGS:
         if is_camera(text):
-            raise InputError("is a camera.", field=text, hint="name recordings; splatbot map maps one camera")
+            raise InputError("is a camera.", field=text, hint="name recordings; splatbot map records and maps a camera")
         log_kind(text)
     elif command in _OF_PATHS and not Path(text).exists():
         raise InputError("does not exist.", file=text, field="INPUT", hint="check the path")
