@@ -171,7 +171,7 @@ class Client(AbstractContextManager["Client"]):
 
         Args:
             map_id: name of the map.
-            log: synthetic:SCENE?..., or a folder under the service's log roots.
+            log: synthetic:SCENE?..., or a folder, .mcap or .bag under the service's log roots.
             key: Idempotency-Key; a repeated request with the same key returns the same job.
             more: camera, max_frames, robot_base, robot, cameras.
         """
