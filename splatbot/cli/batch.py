@@ -170,10 +170,10 @@ def _check_options(words: Sequence[str]) -> None:
 
 
 def _settings(environment: Mapping[str, str]) -> dict[str, str]:
-    """Return the variables that set keys of the configuration, which workers on other machines need too."""
+    """Return the variables that results depend on, which workers on other machines need too."""
     from splatbot.config.layout import known_sections
 
-    sections = known_sections()
+    sections = {*known_sections(), "isa"}
     parts = {name: name.removeprefix("SPLATBOT_").lower().split("__")[0] for name in environment}
     return {
         name: environment[name]

@@ -95,6 +95,23 @@ def test_scores_of_runs_and_trials_are_columns(run: RunCommand, tmp_path: Path) 
     assert (rows[0]["ate_rmse_m"], rows[0]["psnr_db"], rows[1]["success_mesh"]) == (0.0123, 30.25, 0.75)
 
 
+def test_variables_that_results_depend_on_are_recorded_and_keys_are_not(
+    run: RunCommand, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("SPLATBOT_MAPPING__HOLDOUT_EVERY", "SPLATBOT_SEED", "SPLATBOT_API_KEY", "SPLATBOT_DEBUG"):
+        monkeypatch.setenv(name, "1")
+    monkeypatch.setenv("SPLATBOT_ISA", "v2")
+    assert run("batch", "simulate", "tabletop", "--out", tmp_path, "--with", "list").code == 0
+    assert json.loads((tmp_path / "tabletop" / "item.json").read_text())["settings"] == {
+        "SPLATBOT_ISA": "v2",
+        "SPLATBOT_MAPPING__HOLDOUT_EVERY": "1",
+        "SPLATBOT_SEED": "1",
+    }
+    monkeypatch.setenv("SPLATBOT_SEED", "2")
+    answer = run("batch", "simulate", "tabletop", "--out", tmp_path, "--with", "list")
+    assert_fix_named(answer, "the result of another command line: SPLATBOT_ISA=v2")
+
+
 def test_ctrl_c_at_a_terminal_keeps_finished_items_and_leaves_no_process(tmp_path: Path) -> None:
     words = ["batch", "simulate", "wall", "tabletop", "--out", str(tmp_path), "--workers", "1"]
     options = ["--with", "size", "320x240", "--with", "frames", "60"]
