@@ -31,7 +31,8 @@ def test_a_slider_lies_on_two_images_of_one_size() -> None:
     found = re.search(r'class="swipe".*?base64,([^"]+)".*?base64,([^"]+)"', page(), re.S)
     assert found is not None
     a, b = (cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR) for data in found.groups())
-    assert a is not None and b is not None
+    assert a is not None
+    assert b is not None
     assert a.shape == b.shape
     assert np.abs(a.astype(int) - b).max() > 30
 
