@@ -28,8 +28,8 @@ def merge(
     """Merge run A and a later run B of the same place into one run, in the world of A.
 
     Several keyframes of B must agree on the pose of B in A; otherwise nothing is written. Surface of both is fused. A
-    loses what the depth of B sees through, and B adds what A lacks. DIR is a run folder like any other; its log plays
-    both recordings (recordings.yaml). merge.json has the figures of the merge.
+    loses the surface that the depth of B sees through, and B adds the surface that A lacks. DIR is a run folder like
+    any other; its log plays both recordings (recordings.yaml). merge.json has the figures of the merge.
 
     Examples:
         splatbot merge runs/monday runs/tuesday --out runs/both

@@ -36,8 +36,9 @@ class ChangeConstants:
         least_size: [m] its largest side.
         reach: [px] half the side of the window in which a view must see through a point, and may not hit it. It covers
             the errors of poses.
-        same_size, same_color: largest difference of the sides [share of the side] of an object that moved if the
-            colours are equal, and of the colours [0..1] if the sides are. Beyond, other objects are as similar.
+        same_size: largest difference of the sides [share of the side] of an object that moved, if its colours are
+            equal. Other objects of a place may be as similar by chance.
+        same_color: [0..1] the same of its colours, if its sides are equal.
         color_quantiles: quantiles of each channel that describe the colours of an object.
     """
 

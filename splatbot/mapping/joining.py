@@ -1,4 +1,4 @@
-"""Joining of two maps in one world: common surface is fused, and the later map replaces what it contradicts."""
+"""Joining of two maps in one world: common surface is fused, and the later map removes surface that it sees through."""
 
 from __future__ import annotations
 
@@ -106,8 +106,8 @@ def join_models(
 def covered(model: GaussianModel, by: GaussianModel) -> Mask:
     """Return which Gaussians (N,) of a model lie on the surface of another one.
 
-    A Gaussian with the center μ and the normal n covers a point p = μ + d if |nᵀd| is below the gap, and d is within
-    2 σ along the two other axes.
+    A Gaussian with the center μ and the normal n covers a point μ + d if |nᵀd| is below the gap. Across the normal, d
+    must be within 2 σ.
     """
     if not len(model) or not len(by):
         return np.zeros(len(model), np.bool_)
@@ -129,7 +129,7 @@ def covered(model: GaussianModel, by: GaussianModel) -> Mask:
 def without_contradicted(keyframe: Keyframe, later: Sequence[Keyframe]) -> Keyframe:
     """Return a keyframe without the pixels whose surface later keyframes see through.
 
-    Refinement and completion would otherwise bring back what is no longer there. Every fourth pixel along both axes
+    Refinement and completion would otherwise bring back an object that is gone. Every fourth pixel along both axes
     is compared, with at most 40 evenly spaced later keyframes.
     """
     step, depth = CONSTANTS.step, keyframe.depth.numpy()

@@ -143,9 +143,9 @@ def merge_runs(
 ) -> MergedRun:
     """Merge two runs into the run folder ``out``.
 
-    Surface of both is fused, and A loses what the depth of B sees through, in its Gaussians and in its keyframes. The
-    merged run is that of a log that plays both recordings (``recordings.yaml``). It is refined, scored and reported
-    like a mapped one.
+    Surface of both is fused, and A loses the surface that the depth of B sees through, in its Gaussians and in its
+    keyframes. The merged run is that of a log that plays both recordings (``recordings.yaml``). It is refined, scored
+    and reported like a mapped one.
 
     Args:
         aligned: the runs. Gaussians and keyframes of B are moved; the runs on disk stay as they are.
