@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,8 +36,8 @@ class MapAlignmentConstants:
         least_agreeing: number of keyframes that must agree.
         least_share: share of the located keyframes that must agree. Repeated places confirm a wrong transform
             with a part of them.
-        least_sigma: [m], [rad] least standard deviation of the common transform, however well the keyframes agree: both
-            maps have errors that all keyframes share.
+        drift: [m], [rad] standard deviation of the drift of both maps at a keyframe, which adds to that of its
+            alignment. Drift is larger: without it, a few keyframes with much texture would determine the transform.
     """
 
     keyframes: int = 40
@@ -45,7 +45,7 @@ class MapAlignmentConstants:
     agreement: tuple[float, float] = (0.06, 0.06)
     least_agreeing: int = 3
     least_share: float = 0.6
-    least_sigma: tuple[float, float] = (1e-3, 5e-4)
+    drift: tuple[float, float] = (5e-3, 3e-3)
 
 
 CONSTANTS = MapAlignmentConstants()
@@ -89,8 +89,8 @@ def align_maps(
 
     1. Each keyframe of B is matched by features with the keyframes of A that look most alike, and aligned to A.
     2. The transform with which most of these poses agree places all keyframes of B, and each is aligned from there.
-    3. T_a_b is the information-weighted mean of the poses that agree. Its covariance is that of one keyframe, and
-       grows with the scatter of the poses (the Birge ratio, see :func:`splatbot.mapping.bundle.variance_ratio`).
+    3. T_a_b is the information-weighted mean of the poses that agree. Its covariance grows with their scatter (the
+       Birge ratio, see :func:`splatbot.mapping.bundle.variance_ratio`).
 
     Args:
         keyframes_a, keyframes_b: of the two maps, each with poses in its own world.
@@ -120,8 +120,8 @@ def align_maps(
     poses = {k.number: k.T_world_camera for k in chosen}
     agreeing = {n: found for n, found in second.items() if _agrees(common, found, poses[n])}
     T, covariance = fused([_world_of(found, poses[n]) for n, found in agreeing.items()])
-    least = np.diag(np.repeat(np.square(CONSTANTS.least_sigma), 3))
-    return MapAlignment(T, covariance * _birge(T, agreeing, poses) + least, agreeing, len(chosen), len(second))
+    deviation = covariance / len(agreeing) * _birge(T, agreeing, poses)
+    return MapAlignment(T, deviation, agreeing, len(chosen), len(second))
 
 
 def _spread(keyframes: Sequence[Keyframe], most: int) -> list[Keyframe]:
@@ -169,7 +169,8 @@ def _locate(
     """Add the pose of a keyframe among others, if its images and theirs determine it."""
     measured = locate_in_map(prepared, others, start, config)
     if not isinstance(measured, str):
-        found[keyframe.number] = measured
+        drift = np.diag(np.repeat(np.square(CONSTANTS.drift), 3))
+        found[keyframe.number] = replace(measured, covariance=measured.covariance + drift)
 
 
 def _common(located: Mapping[int, MeasuredPose], keyframes: Sequence[Keyframe]) -> Array:

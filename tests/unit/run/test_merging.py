@@ -147,11 +147,12 @@ def test_changed_objects_of_mapped_pairs_have_precision_and_recall_of_95_percent
     right, reported, true = 0, 0, 0
     for seed in range(4):
         pair = scene_pair(seed)
-        logs = SceneLog(pair.before, "orbit", seed=seed), SceneLog(pair.after, "arm", seed=seed + 100, start=1.0)
+        a = SceneLog(pair.before, "orbit", seed=seed, frames=45)
+        b = SceneLog(pair.after, "arm", seed=seed + 100, start=1.0, frames=45)
         before, after = tmp_path / f"{seed}a", tmp_path / f"{seed}b"
-        for log, folder in zip(logs, (before, after), strict=True):
+        for log, folder in ((a, before), (b, after)):
             map_log(log, out=folder, config=QUICK, save_every=1e9, report=False)
-        found = reported_places(compare_runs(before, after).objects, logs[0].ground_truth.T_world_camera[0])
+        found = reported_places(compare_runs(before, after).objects, a.ground_truth.T_world_camera[0])
         right, reported, true = right + matches(found, pair.places), reported + len(found), true + len(pair.places)
     print(f"precision {right / reported:.3f}, recall {right / true:.3f} of {true} places")
     assert right / reported >= 0.95
