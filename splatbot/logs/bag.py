@@ -26,6 +26,7 @@ from splatbot.logs.joints import JointStates
 from splatbot.logs.mcap import COLOR, DEPTH, INFO, JOINTS, MASK, TRUTH
 from splatbot.logs.mcap_storage import check_checksums
 from splatbot.logs.presets import find_calibration
+from splatbot.logs.ros_cameras import CameraPair, RosCameras
 from splatbot.logs.ros_frames import (
     COLOR_ENCODINGS,
     DEPTH_ENCODINGS,
@@ -38,17 +39,23 @@ from splatbot.logs.ros_frames import (
     seconds_of,
     to_nanoseconds,
 )
-from splatbot.logs.ros_transforms import TF, TF_STATIC, StampedTransform, transforms_of
+from splatbot.logs.ros_transforms import TF, TF_STATIC, StampedTransform, static_transform, transforms_of
 from splatbot.logs.ros_types import Message, typestore
 from splatbot.logs.streams import bag_streams, header_stamp, obstacle_to_mapping
 from splatbot.logs.undistort import Undistorter
+from splatbot.protocols import Array
 from splatbot.trajectory import Trajectory
 
-KEYS = ("color", "depth", "info", "joints", PAIR_WITHIN)
+KEYS = ("color", "depth", "info", "joints", "registered", PAIR_WITHIN)
 _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _T = TypeVar("_T")
 
 _log = logging.getLogger(__name__)
+
+
+def _info_of(topic: str) -> str:
+    """Return the topic of the CameraInfo next to an image topic."""
+    return f"{topic.removesuffix('/compressed').removesuffix('/compressedDepth').rsplit('/', 1)[0]}/camera_info"
 
 
 @dataclass(frozen=True)
@@ -68,16 +75,21 @@ class BagLog(StampedLog):
     and reference poses from /ground_truth/pose. Frames are :class:`splatbot.logs.ros_frames.RosFrame`; they are decoded
     on access, and the file stays open. The class is not thread-safe.
 
+    Where depth is of another camera by its frame_id or size, colour is put at its pixels: its camera_info and
+    /tf_static describe the two cameras (:class:`splatbot.logs.ros_cameras.CameraPair`).
+
     Args:
         path: the file or folder.
         camera: intrinsics that replace the recorded CameraInfo.
         options: topics to read by the keys `color`, `depth`, `info` and `joints`, needed if the recording has several.
-            `pair_within` is the largest difference [s] of the stamps of a pair.
+            `pair_within` is the largest difference [s] of the stamps of a pair. `registered=1` states that depth
+            is registered to colour whatever its headers say.
         joint_delay: time [s] by which the stamps of joint positions are later than their motion.
 
     Raises:
         LogError: the file is missing or damaged, a topic is missing or ambiguous, or nothing can be paired.
         CameraError: there are no usable intrinsics.
+        InputError: depth is of another camera, whose intrinsics or place are not recorded.
     """
 
     def __init__(
@@ -101,14 +113,13 @@ class BagLog(StampedLog):
         self._calibration = (
             find_calibration(camera) if camera is not None else Calibration(self._recorded_camera(), MILLIMETRES)
         )
-        found = self._calibration.camera
-        self._undistort = Undistorter(found) if found.distortion else None
-        self._camera = self._undistort.camera if self._undistort else found
+        self._cameras = self._camera_pair()
+        self._undistort_mask = Undistorter(self._cameras.color) if self._cameras.color.distortion else None
 
     @property
     def camera(self) -> Camera:
         """Camera of the delivered frames: undistorted."""
-        return self._camera
+        return self._cameras.camera
 
     @property
     def calibration(self) -> Calibration:
@@ -152,29 +163,55 @@ class BagLog(StampedLog):
         z = self._checked(self._depth, lambda: depth_of(self._read(self._depth, depth)))
         mask = self._mask(color.stamp)
         where = f"{self.path} {self._color} {index}"
-        if rgb.shape[:2] != z.shape:
-            hint = "record depth registered to colour: aligned_depth_to_color, depth_registered"
-            raise LogError(f"depth is {z.shape}, colour {rgb.shape[:2]} (rows, columns).", file=where, hint=hint)
-        if self._undistort:
-            rgb, z = self._undistort.color(rgb), self._undistort.depth(z)
-            mask = None if mask is None else self._undistort.mask(mask)
         names, joints = self._joints.at(color.stamp + self._joint_delay) or ((), None)
         try:
+            rgb, z = self._cameras.images(rgb, z)
+            if mask is not None and self._undistort_mask is not None:
+                mask = self._undistort_mask.mask(mask)
             return RosFrame(
                 color.stamp,
                 rgb,
                 z,
-                self._camera,
+                self._cameras.camera,
                 index,
                 joints=joints,
                 mask=mask,
                 source=where,
                 depth_delay=depth.stamp - color.stamp,
                 joint_names=names,
-                camera_frame=message.header.frame_id.strip("/"),
+                camera_frame=self._camera_frame,
             )
         except InputError as error:
             raise LogError(error.message, file=where, field=error.field, hint=error.hint) from error
+
+    def _camera_pair(self) -> CameraPair:
+        """Return the cameras of colour and depth by the headers of their first messages.
+
+        Raises:
+            InputError: depth is of another camera, whose intrinsics or place are not recorded.
+        """
+        (color, depth), hint = self._pairs[0], f"state it, if depth is registered: {self.path.name}?registered=1"
+        colors, depths = self._read(self._color, color), self._read(self._depth, depth)
+        color_frame, depth_frame = (image.header.frame_id.strip("/") for image in (colors, depths))
+        self._camera_frame = color_frame
+        cameras = RosCameras(self._static_transform)
+        cameras.color = self._calibration.camera
+        same_size = color_of(colors).shape[:2] == depth_of(depths).shape
+        if self._given.get("registered") == "1" or (same_size and depth_frame in ("", color_frame)):
+            return cameras.pair("", "")
+        info = next(iter(self._all(_info_of(self._depth))), None)
+        cameras.depth = None if info is None else self._checked(_info_of(self._depth), lambda: camera_of(info))
+        try:
+            pair = cameras.pair(color_frame, depth_frame)
+        except InputError as error:
+            raise LogError(error.message, file=self.path, field=self._depth, hint=f"{error.hint}; {hint}") from error
+        if MASK in self._index and not pair.one:
+            raise LogError("are of colour, but depth is of another camera.", file=self.path, field=MASK, hint=hint)
+        self._camera_frame = depth_frame or color_frame
+        return pair
+
+    def _static_transform(self, target: str, source: str) -> Array | None:
+        return static_transform(self.transforms(), target, source)
 
     @cached_property
     def _joints(self) -> JointStates:
@@ -196,7 +233,7 @@ class BagLog(StampedLog):
         raise LogError("holds no message.", file=self.path, field=topic, hint="give --camera FILE")
 
     def _info_topic(self) -> str:
-        sibling = f"{self._color.removesuffix('/compressed').rsplit('/', 1)[0]}/camera_info"
+        sibling = _info_of(self._color)
         known = [c.topic for c in self._reader.connections if c.msgtype == "sensor_msgs/msg/CameraInfo"]
         for topic in (sibling, INFO, *(known if len(set(known)) == 1 else ())):
             if topic in known:
@@ -307,6 +344,8 @@ class BagLog(StampedLog):
     def _all(self, topic: str) -> Iterable[Message]:
         """Yield the messages of a topic in the order of their receive times."""
         of_topic = [c for c in self._reader.connections if c.topic == topic]
+        if not of_topic:  # the reader yields all topics for none
+            return
         try:
             for connection, _, raw in self._reader.messages(of_topic):
                 yield self._reader.deserialize(raw, connection.msgtype)

@@ -30,6 +30,7 @@ class CameraPair:
 
     Attributes:
         camera: undistorted camera of the images: that of depth.
+        one: whether colour and depth are of one camera.
     """
 
     def __init__(self, color: Camera, depth: Camera, T_color_depth: ArrayLike) -> None:
@@ -38,8 +39,8 @@ class CameraPair:
         self._lens_of_depth = Undistorter(depth) if depth.distortion else None
         straight = self._lens_of_color.camera if self._lens_of_color else color
         self.camera = self._lens_of_depth.camera if self._lens_of_depth else depth
-        one = color == depth and np.array_equal(self.T_color_depth, np.eye(4))
-        self._registration = None if one else ColorRegistration(straight, self.camera, self.T_color_depth)
+        self.one = color == depth and np.array_equal(self.T_color_depth, np.eye(4))
+        self._registration = None if self.one else ColorRegistration(straight, self.camera, self.T_color_depth)
 
     def images(
         self, rgb: NDArray[np.uint8], depth: NDArray[np.float32]

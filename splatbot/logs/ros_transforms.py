@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 
+import numpy as np
+
+from splatbot.geometry import inverse, pose_from_quat
 from splatbot.logs.ros_frames import seconds_of
 from splatbot.logs.ros_types import Message
+from splatbot.protocols import Array
 
 TF, TF_STATIC = "/tf", "/tf_static"
 _LONGEST_NAME = 256
@@ -33,6 +37,10 @@ class StampedTransform:
     quat: Collection[float]
     static: bool = False
 
+    def pose(self) -> Array:
+        """Return T_parent_child (4, 4) [m]."""
+        return pose_from_quat(list(self.translation), np.array([*self.quat]) / math.hypot(*self.quat))
+
     def is_usable(self) -> bool:
         """Return whether the names are distinct and of a fair length, and the numbers finite and a pose."""
         names, numbers = (self.parent, self.child), (self.stamp, *self.translation, *self.quat)
@@ -43,6 +51,22 @@ class StampedTransform:
             and max(map(abs, self.translation)) <= _FARTHEST
             and any(self.quat)
         )
+
+
+def static_transform(transforms: Iterable[StampedTransform], target: str, source: str) -> Array | None:
+    """Return T_target_source (4, 4) [m] of two frames that static transforms connect, or None."""
+    edges = {t.child: (t.parent, t.pose()) for t in transforms if t.static and t.is_usable()}
+
+    def ancestors(frame: str) -> dict[str, Array]:
+        found, T = {frame: np.eye(4)}, np.eye(4)
+        while frame in edges and edges[frame][0] not in found:
+            frame, pose = edges[frame]
+            found[frame] = T = pose @ T
+        return found
+
+    of_target, of_source = ancestors(target), ancestors(source)
+    common = next((frame for frame in of_source if frame in of_target), None)
+    return None if common is None else inverse(of_target[common]) @ of_source[common]
 
 
 def transforms_of(message: Message, *, static: bool) -> Iterator[StampedTransform]:
