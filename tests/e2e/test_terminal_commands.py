@@ -71,6 +71,8 @@ _WORDS = {
     ],
     "grasp": ["grasp", "--map", "{run}", "--target", "largest object", "--hand-only", "--out", "{out}/grasp"],
     "objects": ["objects", "{run}"],
+    "merge": ["merge", "{run}", "{run}", "--no-report", "--out", "{out}/merged"],
+    "diff": ["diff", "{run}", "{run}", "--out", "{out}/diff.png"],
     "export": ["export", "{run}", "--format", "points", "octomap", "--voxel", "0.05", "--out", "{out}/export"],
     "compact": ["compact", "{run}", "--sweep"],
     "compare": ["compare", "{run}", "{run}/map.ply", "--views", "1", "--out", "{out}/compare.html"],
