@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from splatbot.rasterize import rasterization, rasterization_2dgs
     from splatbot.slam import Slam
 
-__version__ = "0.1.0"
+    __version__: str
 
 _HOME = {
     "Camera": "splatbot.camera",
@@ -49,7 +49,14 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Import public names on first use: torch alone takes seconds, and `splatbot --help` needs none of it."""
+    """Import public names on first use: torch alone takes seconds, and `splatbot --help` needs none of it.
+
+    The version is that of the installed package, which pyproject.toml alone states.
+    """
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("splatbot")
     if name not in _HOME:
         raise AttributeError(f"module 'splatbot' has no attribute {name!r}")
     return getattr(importlib.import_module(_HOME[name]), name)

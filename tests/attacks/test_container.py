@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import subprocess
@@ -12,15 +11,16 @@ from pathlib import Path
 import pytest
 
 from splatbot.services.settings import ServiceSettings
+from tests.container import health_check
 from tests.contracts.conftest import running
-from tests.unit.test_docker import DOCKERFILE
 
 
 def probe(url: str, *, tls: bool) -> int:
     """Return the exit code of the image's health check."""
-    command = json.loads(DOCKERFILE.split("HEALTHCHECK")[1].split("CMD ", 1)[1].splitlines()[0])
     environment = os.environ | {"SPLATBOT_PORT": url.rsplit(":", 1)[1]} | ({"SPLATBOT_TLS_CERT": "x"} if tls else {})
-    return subprocess.run([sys.executable, *command[1:]], env=environment, capture_output=True, timeout=60).returncode
+    return subprocess.run(
+        [sys.executable, *health_check()[1:]], env=environment, capture_output=True, timeout=60
+    ).returncode
 
 
 @pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl makes the certificate")
