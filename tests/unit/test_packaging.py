@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import ast
+import email
 import os
+import re
 import subprocess
 import sys
+import sysconfig
 import tomllib
+import zipfile
 from pathlib import Path
 
 import pytest
+
+import splatbot
+from tests.container import copy_build_context
 
 ROOT = Path(__file__).parents[2]
 LINKED = ("services", "robots", "sim", "configs")
@@ -53,10 +60,15 @@ def test_every_module_of_the_core_is_under_the_contract_on_external_packages() -
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with an sdist of this checkout and the wheel built from that sdist, without optimization."""
-    out = tmp_path_factory.mktemp("dist")
-    options = ("--no-isolation", "--config-setting=cmake.build-type=Debug", "--outdir", str(out))
-    _run(sys.executable, "-m", "build", *options, str(ROOT))
+    """A folder with an sdist of the files that the image's builder copies, and the wheel built from that sdist.
+
+    The wheel is compiled with little optimization.
+    """
+    out, context = tmp_path_factory.mktemp("dist"), tmp_path_factory.mktemp("context")
+    copy_build_context(context)
+    quick = ("cmake.build-type=Debug", "cmake.define.CMAKE_CXX_FLAGS_DEBUG=-O1")
+    options = ("--no-isolation", *(f"--config-setting={option}" for option in quick), "--outdir", str(out))
+    _run(sys.executable, "-m", "build", *options, str(context))
     return out
 
 
@@ -90,3 +102,59 @@ def test_the_wheel_that_is_built_from_the_sdist_is_whole_when_installed(built: P
     assert all(place.startswith(str(target)) and Path(place).is_file() for place in places), places
     assert not (target / "splatbot" / "native").exists(), "C++ sources belong into the sdist alone"
     assert not any((target / name).exists() for name in LINKED), "a generic top-level name landed in site-packages"
+
+
+@pytest.fixture(scope="module")
+def bare(built: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The programs of a new environment with the wheel, which finds its dependencies in the one of this test.
+
+    A line of a .pth file adds a folder to the path without the .pth files in it, so that this checkout is not found.
+    """
+    folder = tmp_path_factory.mktemp("bare")
+    _run(sys.executable, "-m", "venv", "--without-pip", str(folder))
+    (site,) = folder.glob("lib/python*/site-packages")
+    (site / "dependencies.pth").write_text(sysconfig.get_path("purelib") + "\n", encoding="utf-8")
+    (archive,) = built.glob("*.whl")
+    pip = (sys.executable, "-m", "pip", f"--python={folder / 'bin' / 'python'}", "--disable-pip-version-check")
+    _run(*pip, "install", "--no-deps", "--no-index", "--ignore-installed", str(archive), cwd=folder)
+    return folder / "bin"
+
+
+@pytest.mark.long
+@pytest.mark.alone
+def test_the_wheel_states_its_version_its_extras_and_its_types(built: Path) -> None:
+    (archive,) = built.glob("*.whl")
+    with zipfile.ZipFile(archive) as wheel:
+        names = wheel.namelist()
+        (about,) = [name for name in names if name.endswith(".dist-info/METADATA")]
+        metadata = email.message_from_bytes(wheel.read(about))
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert metadata["Version"] == project["version"]
+    assert set(metadata.get_all("Provides-Extra", [])) == set(project["optional-dependencies"])
+    assert "splatbot/py.typed" in names
+
+
+@pytest.mark.long
+@pytest.mark.alone
+def test_the_wheel_maps_a_log_and_runs_the_demo_without_the_checkout(bare: Path, tmp_path: Path) -> None:
+    environ = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "VIRTUAL_ENV")}
+
+    def run(*words: str) -> str:
+        return _run(str(bare / "splatbot"), *words, cwd=tmp_path, env=environ)
+
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
+    assert run("--version").strip() == version
+    place = _run(
+        str(bare / "python"), "-c", "import splatbot._native as n; print(n.__file__)", cwd=tmp_path, env=environ
+    )
+    assert place.startswith(str(bare.parent))
+    run("map", "synthetic:tabletop?frames=6&width=160&height=120&arc=4", "--out", "run")
+    assert (tmp_path / "run" / "map.ply").stat().st_size > 10_000
+    run("demo", "--frames", "6", "--out", "demo")
+    assert (tmp_path / "demo" / "report.html").is_file()
+
+
+def test_the_version_is_stated_in_one_place() -> None:
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
+    assert splatbot.__version__ == version
+    assert not re.search(rf'"{re.escape(version)}"', (ROOT / "splatbot" / "__init__.py").read_text(encoding="utf-8"))
