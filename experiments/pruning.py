@@ -30,7 +30,7 @@ _SPREAD, _LARGEST = 0.03, 0.05  # [m] of the centres around Gaussians, and large
 _TOUCH = 1e-6  # [m]
 
 
-class Row(NamedTuple):
+class SmallerMaps(NamedTuple):
     """Quality of two smaller maps: PSNR of held-out views [dB], and missed ones of the spheres that hit the map."""
 
     share: float
@@ -41,7 +41,7 @@ class Row(NamedTuple):
     missed_by_compacted: int
 
 
-def measure(folder: Path, spheres: int) -> list[Row]:
+def measure(folder: Path, spheres: int) -> list[SmallerMaps]:
     """Prune and compact the map of a run or a training, for each share of its Gaussians."""
     views = recorded_views(folder)
     if views is None:
@@ -55,7 +55,7 @@ def measure(folder: Path, spheres: int) -> list[Row]:
         small = model.select(order[:count].sort().values), compact(model, weights, count)
         pruned_db, compacted_db = (views.score(each, len(views.held_out))["psnr_db"] for each in small)
         found = [_missed(model, small, n_sigma, spheres // len(_N_SIGMAS)) for n_sigma in _N_SIGMAS]
-        rows.append(Row(share, pruned_db, compacted_db, *(int(total) for total in np.sum(found, axis=0))))
+        rows.append(SmallerMaps(share, pruned_db, compacted_db, *(int(total) for total in np.sum(found, axis=0))))
     return rows
 
 

@@ -40,7 +40,7 @@ CONSTANTS = ComparisonConstants()
 
 
 @dataclass(frozen=True, eq=False)
-class MapView:
+class SeenMap:
     """A map from one pose.
 
     Args:
@@ -72,8 +72,8 @@ class ComparedView:
     """
 
     name: str
-    a: MapView
-    b: MapView
+    a: SeenMap
+    b: SeenMap
     recorded: Image | None
     scores: Mapping[str, float | None]
 
@@ -136,14 +136,14 @@ def doubts(means: Mapping[str, Any]) -> list[str]:
     return []
 
 
-def _seen(model: GaussianModel, camera: Camera, T_world_camera: Array, background: NDArray[np.float32]) -> MapView:
+def _seen(model: GaussianModel, camera: Camera, T_world_camera: Array, background: NDArray[np.float32]) -> SeenMap:
     rgb, alpha, depth = render_rgbd(model, camera, T_world_camera)
     rgb = np.clip(rgb + (1.0 - alpha[..., None]) * background, 0.0, 1.0)
     covered = alpha >= CONSTANTS.min_alpha
-    return MapView(np.rint(255.0 * rgb).astype(np.uint8), np.where(covered, depth, np.float32(0)))
+    return SeenMap(np.rint(255.0 * rgb).astype(np.uint8), np.where(covered, depth, np.float32(0)))
 
 
-def _scores(a: MapView, b: MapView) -> dict[str, float | None]:
+def _scores(a: SeenMap, b: SeenMap) -> dict[str, float | None]:
     both, either = a.covered & b.covered, a.covered | b.covered
     difference = np.abs(b.depth[both] - a.depth[both]) / a.depth[both]
     return {
