@@ -41,7 +41,7 @@ class CameraRig:
 
     Attributes:
         first_name: name of the first camera in the file.
-        dropped: frames that arrived too late or that nobody read in time, with those that the cameras lost.
+        dropped: frames that arrived too late or that no reader took in time, with those that the cameras lost.
 
     Args:
         path: YAML file, as of :class:`splatbot.logs.rig.RigLog`, whose ``log`` are addresses of cameras.
@@ -145,7 +145,7 @@ class CameraRig:
                 self._changed.wait(wait)
 
     def _read(self, part: _Part) -> None:
-        """Collect the frames of one camera; the oldest gives way when nobody reads them."""
+        """Collect the frames of one camera; the oldest is dropped when there are too many."""
         try:
             for frame in part.camera:
                 named = replace(frame, stamp=frame.stamp + part.time_offset, camera_name=part.name)

@@ -75,7 +75,7 @@ class BagLog(StampedLog):
     and reference poses from /ground_truth/pose. Frames are :class:`splatbot.logs.ros_frames.RosFrame`; they are decoded
     on access, and the file stays open. The class is not thread-safe.
 
-    Where depth is of another camera by its frame_id or size, colour is put at its pixels: its camera_info and
+    Where depth is of another camera by its frame_id or size, colour is put at its pixels. Its camera_info and
     /tf_static describe the two cameras (:class:`splatbot.logs.ros_cameras.CameraPair`).
 
     Args:
@@ -83,7 +83,7 @@ class BagLog(StampedLog):
         camera: intrinsics that replace the recorded CameraInfo.
         options: topics to read by the keys `color`, `depth`, `info` and `joints`, needed if the recording has several.
             `pair_within` is the largest difference [s] of the stamps of a pair. `registered=1` states that depth
-            is registered to colour whatever its headers say.
+            is registered to colour, against its headers.
         joint_delay: time [s] by which the stamps of joint positions are later than their motion.
 
     Raises:

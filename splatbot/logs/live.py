@@ -41,7 +41,7 @@ def further_file(path: str | Path, name: str) -> Path:
 
 
 def recover_recording(path: str | Path) -> None:
-    """Recover the recordings that a killed process left, if there are any.
+    """Give the recordings that a killed process left their names, if there are any.
 
     Raises:
         LogError: another process records into them.
