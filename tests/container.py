@@ -1,8 +1,7 @@
 """The image of docker/Dockerfile, run in Linux namespaces as docker/compose.yaml describes it, without an engine.
 
-The virtual environment of this checkout replaces the one that the image's builder makes, and the folders of this
-machine with programs and libraries replace the base image. Limits of memory and processes, which need cgroups, do not
-apply.
+The virtual environment of this checkout replaces the one that the image's builder makes. This machine's folders with
+programs and libraries replace the base image. Limits of memory and processes, which need cgroups, do not apply.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
-"""Containers of docker/compose.yaml, started in namespaces with the image's user, variables, mounts and rights.
+"""Containers of docker/compose.yaml, and the pod of docker/kubernetes.yaml, started in namespaces.
 
-No engine is needed. `tests/container.py` states the differences from an image that an engine builds.
+They have the user, variables, mounts and rights of the image and the recipe. No engine is needed.
+`tests/container.py` states the differences from an image that an engine builds.
 """
 
 from __future__ import annotations
@@ -13,15 +14,18 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
-from tests.container import container_of, started
+from tests.container import ROOT, container_of, started
 from tests.contracts.conftest import wall
 from tests.e2e.conftest import splatbot_here
 from tests.waiting import until
 
 NAMESPACES = ["unshare", "--mount", "--pid", "--net", "--fork", "true"]
 GET = """import sys, urllib.request as u
-print(u.urlopen(u.Request(sys.argv[1], headers={'X-API-Key': sys.argv[2]})).read().decode())"""
+url, key, *host = sys.argv[1:]
+headers = {'X-API-Key': key} | {'Host': name for name in host}
+print(u.urlopen(u.Request(url, headers=headers)).read().decode())"""
 
 pytestmark = [
     pytest.mark.long,
@@ -107,4 +111,29 @@ def test_the_replay_maps_a_simulated_scene_and_opens_its_viewer(
         until(gaussians, timeout_s=120)
         viewer = container.run(["python", "-c", GET, "http://127.0.0.1:8011/", key])
         assert "HTTP Error 401" in viewer.stderr
+        assert container.stop() == 0
+
+
+def test_the_pod_of_the_cluster_is_ready_without_maps_and_answers_to_the_name_of_its_service(
+    variables: dict[str, str], key_and_hash: tuple[str, str], tmp_path: Path
+) -> None:
+    """Folders of this machine replace the volumes; the kubelet's probes are requests from inside."""
+    objects = {one["kind"]: one for one in yaml.safe_load_all((ROOT / "docker" / "kubernetes.yaml").read_text())}
+    (pod,) = objects["Deployment"]["spec"]["template"]["spec"]["containers"]
+    recipe = container_of("splatbot", variables)
+    recipe["command"] = pod["args"]
+    recipe["environment"] |= objects["ConfigMap"]["data"]
+    mounts = {mount["mountPath"] for mount in pod["volumeMounts"]} - {"/tmp"}
+    recipe["volumes"] = [f"{mount.strip('/')}:{mount}" for mount in mounts]
+    with started(recipe, tmp_path) as container:
+        until(container.is_healthy, timeout_s=120)
+        for kind in ("startupProbe", "livenessProbe", "readinessProbe"):
+            probe = container.run(["python", "-c", GET, f"http://127.0.0.1:8000{pod[kind]['httpGet']['path']}", ""])
+            assert probe.returncode == 0, probe.stderr
+        (service, foreign) = (
+            container.run(["python", "-c", GET, "http://127.0.0.1:8000/v1/maps", key_and_hash[0], host])
+            for host in ("splatbot.default.svc:8000", "other.default.svc:8000")
+        )
+        assert json.loads(service.stdout) == {"maps": []}
+        assert "HTTP Error 421" in foreign.stderr
         assert container.stop() == 0
