@@ -8,6 +8,7 @@ from functools import lru_cache
 import numpy as np
 
 from splatbot.errors import InputError
+from splatbot.robots.hands import HAND_NAMES
 from splatbot.robots.joints import Joint
 from splatbot.robots.robot import RobotModel, joint_transform
 from splatbot.workspace import NAME, Workspace
@@ -24,14 +25,28 @@ def robot_in_scene(robot: RobotModel, scene: Workspace | None) -> RobotModel:
         scene: description of the scene. Without joint offsets, the robot is returned as it is.
 
     Raises:
-        InputError: there is not one offset for each joint, or an offset leaves a joint no position.
+        InputError: the offsets are those of another arm, or their arm is not named. There is not one offset for each
+            joint, or an offset leaves a joint no position.
     """
     if scene is None or scene.joint_offsets is None or not scene.joint_offsets.any():
         return robot
+    arm = arm_name(robot.name)
+    if not scene.offsets_of:
+        hint = f"add offsets_of: {arm} if they were calibrated for it, or calibrate again: splatbot calibrate hand-eye"
+        raise InputError("does not name the arm of the joint_offsets.", file=NAME, field="offsets_of", hint=hint)
+    if scene.offsets_of != arm:
+        hint = f"name a robot with the arm {scene.offsets_of}, or calibrate {arm}: splatbot calibrate hand-eye"
+        raise InputError(f"are those of {scene.offsets_of}, not {arm}.", file=NAME, field="joint_offsets", hint=hint)
     if len(scene.joint_offsets) != len(robot):
-        hint = f"{robot.name} has {len(robot)} joints; name the robot of the scene"
+        hint = f"{robot.name} has {len(robot)} joints"
         raise InputError(f"has {len(scene.joint_offsets)} values.", file=NAME, field="joint_offsets", hint=hint)
     return _with_offsets(robot, tuple(scene.joint_offsets.tolist()))
+
+
+def arm_name(robot: str) -> str:
+    """Return the name of a robot's arm: that of the robot without the hand, as ``panda`` of ``panda-2f85``."""
+    arm, _, hand = robot.rpartition("-")
+    return arm if hand in HAND_NAMES else robot
 
 
 @lru_cache(maxsize=8)

@@ -97,7 +97,8 @@ def workspace_of(uri: str, robot_base: Any) -> Workspace | None:
     known = None if uri.startswith("synthetic:") else find_workspace(uri)
     if robot_base is None:
         return known
-    return Workspace(T_world_base=robot_base, joint_offsets=None if known is None else known.joint_offsets)
+    arm = known or Workspace()
+    return Workspace(T_world_base=robot_base, joint_offsets=arm.joint_offsets, offsets_of=arm.offsets_of)
 
 
 def open_rig(uri: str) -> tuple[Log, dict[str, Workspace]]:

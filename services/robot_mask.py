@@ -20,6 +20,7 @@ from splatbot.logs.joints import MAX_GAP, interpolate_joints, select_joints
 from splatbot.mapping.selfmask import JointsUnknownError, SelfMask
 from splatbot.protocols import Array, FrameSource
 from splatbot.robots.in_view import recorded_links, self_mask
+from splatbot.robots.joint_offsets import robot_in_scene
 from splatbot.robots.link_poses import LinkPoses
 from splatbot.robots.robot import RobotModel
 from splatbot.robots.tf_buffer import TransformBuffer
@@ -161,6 +162,8 @@ class RobotMask:
     ) -> None:
         self.robot, self._workspace = robot, workspace or Workspace()
         self._workspaces = {"": self._workspace, **(further or {})}
+        for scene in self._workspaces.values():
+            robot_in_scene(robot, scene)  # refuses offsets with which no plan in the map would begin
         self._recorded = {} if log is None else recorded_links(robot, self._workspaces, log)
         self._in_tf = {*self._recorded, *([""] if camera_in_tf else [])}
         self._topics = topics

@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints, model_vali
 from splatbot.errors import InputError
 from splatbot.geometry import pose_from_quat
 from splatbot.planning.timing import DEFAULT_SPEED
+from splatbot.robots.joint_offsets import arm_name
 from splatbot.services.arrays import Configurations, Points
 from splatbot.workspace import MAX_JOINT_DELAY_S, MAX_PREFIX, Workspace
 
@@ -110,7 +111,9 @@ class RobotInView(Request):
     )
     camera_link: int = Field(-1, description="index of the link that carries the camera; -1: the last, 0: the base")
     joint_offsets: list[float] | None = Field(
-        None, max_length=MAX_JOINTS, description="added to measured joint positions [rad or m]"
+        None,
+        max_length=MAX_JOINTS,
+        description="added to measured joint positions [rad or m]; null: none; left out: those of the recording",
     )
     joint_delay: float = Field(
         0.0,
@@ -131,13 +134,26 @@ class RobotInView(Request):
         Raises:
             InputError: a value is invalid.
         """
-        given: dict[str, Any] = {name: getattr(self, name) for name in self.model_fields_set - {"name"}}
+        known = self.with_offsets(known)
+        own = self.model_fields_set - {"name", "joint_offsets"}
+        given: dict[str, Any] = {name: getattr(self, name) for name in own}
         if self.T_link_camera is not None:
             given["T_link_camera"] = self.T_link_camera.matrix("T_link_camera")
-        if self.joint_offsets is not None:
-            given["joint_offsets"] = np.array(self.joint_offsets)
-        given["joint_names"] = tuple(given.get("joint_names", known.joint_names if known is not None else ()))
-        return replace(known or Workspace(), **given)
+        given["joint_names"] = tuple(given.get("joint_names", known.joint_names))
+        return replace(known, **given)
+
+    def with_offsets(self, known: Workspace | None) -> Workspace:
+        """Return a scene with the given joint offsets; if they are left out, with those of the known scene.
+
+        Raises:
+            InputError: an offset is not finite.
+        """
+        scene = known or Workspace()
+        if "joint_offsets" not in self.model_fields_set:
+            return scene
+        if self.joint_offsets is None:
+            return replace(scene, joint_offsets=None, offsets_of="")
+        return replace(scene, joint_offsets=np.array(self.joint_offsets), offsets_of=arm_name(self.name))
 
 
 class RobotMaskInfo(BaseModel):

@@ -31,6 +31,7 @@ _KEYS = (
     "camera_link",
     "objects",
     "joint_offsets",
+    "offsets_of",
     "joint_delay",
     "joint_names",
     "tf_prefix",
@@ -89,6 +90,7 @@ class Workspace:
         camera_link: index of the link that carries the camera; -1 is the last one, 0 the base.
         objects: named objects.
         joint_offsets: (J,) offsets to be added to measured joint positions [rad or m].
+        offsets_of: name of the arm that has these offsets, without its hand; empty if unknown.
         joint_delay: time [s] by which the stamps of measured joint positions are later than the motion.
         joint_names: (J,) names of the robot's joints in recordings, if they are not those of its model.
         tf_prefix: prefix of the names of the robot's links in TF, as ``left_``.
@@ -106,6 +108,7 @@ class Workspace:
     camera_link: int = -1
     objects: tuple[NamedPlace, ...] = ()
     joint_offsets: Array | None = None
+    offsets_of: str = ""
     joint_delay: float = 0.0
     joint_names: tuple[str, ...] = ()
     tf_prefix: str = ""
@@ -123,6 +126,9 @@ class Workspace:
         _check("T_link_camera", self.T_link_camera, (4, 4), "a pose")
         if self.joint_offsets is not None:
             _check("joint_offsets", self.joint_offsets, (self.joint_offsets.size,), "one number for each joint")
+        if not isinstance(self.offsets_of, str):
+            hint = "give the name of the arm that has the joint_offsets, as panda"
+            raise InputError(f"is {self.offsets_of!r}.", field="offsets_of", hint=hint)
         for name, T in (("T_world_base", self.T_world_base), ("T_link_camera", self.T_link_camera)):
             if T is not None and np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > 1e-6:
                 raise InputError("is no rigid pose.", field=name, hint="give a rotation and a translation")
@@ -161,6 +167,7 @@ class Workspace:
                 camera_link=found.get("camera_link", -1),
                 objects=_places(found.get("objects")),
                 joint_offsets=_array(found.get("joint_offsets"), "joint_offsets"),
+                offsets_of=found.get("offsets_of", ""),
                 joint_delay=_number(found.get("joint_delay", 0.0), "joint_delay"),
                 joint_names=_names(found.get("joint_names", [])),
                 tf_prefix=found.get("tf_prefix", ""),
@@ -182,6 +189,8 @@ class Workspace:
                 document[key] = _plain(value, 9)
         if self.joint_offsets is not None:
             document["joint_offsets"] = _plain(self.joint_offsets)
+        if self.offsets_of:
+            document["offsets_of"] = self.offsets_of
         if self.joint_delay:
             document["joint_delay"] = round(self.joint_delay, 6)
         if self.joint_names:

@@ -6,12 +6,10 @@ import hashlib
 import os
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import replace
 from functools import partial
 from pathlib import Path as FilePath
 from typing import Annotated, Any
 
-import numpy as np
 from fastapi import APIRouter, Depends, Path, Request, Response
 from starlette.background import BackgroundTask
 from starlette.concurrency import run_in_threadpool
@@ -323,9 +321,7 @@ def _masked(mask: RobotMask) -> RobotMaskInfo:
 def _scene(query: MapRequest, uri: str, base: Array | None) -> Workspace | None:
     """Return the scene of a map: base and joint offsets of the request, or those of the recording."""
     known = workspace_of(uri, base)
-    if query.robot is None or query.robot.joint_offsets is None:
-        return known
-    return replace(known or Workspace(), joint_offsets=np.array(query.robot.joint_offsets))
+    return known if query.robot is None else query.robot.with_offsets(known)
 
 
 def _open_masked(query: MapRequest, uri: str) -> tuple[Log, RobotMask | None]:

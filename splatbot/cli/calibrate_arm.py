@@ -357,6 +357,7 @@ def _completed(
     import numpy as np
 
     from splatbot.geometry import inverse
+    from splatbot.robots.joint_offsets import arm_name
 
     offsets = np.zeros(0 if arm is None else len(arm.chain))
     offsets[: len(found.joint_offsets)] = found.joint_offsets
@@ -365,6 +366,7 @@ def _completed(
         T_link_camera=found.T_base_static if link == 0 else found.T_link_moving,
         camera_link=link,
         joint_offsets=offsets if offsets.any() else None,
+        offsets_of=arm_name(arm.name) if arm is not None and offsets.any() else "",
         T_world_base=inverse(found.T_base_static) if tracked else scene.T_world_base,
         joint_delay=_joint_delay(found, scene.joint_delay) if tracked and arm is not None else scene.joint_delay,
     )

@@ -90,6 +90,7 @@ def test_images_of_a_board_give_a_camera_file_and_a_scene(run: RunCommand, tmp_p
     written = Workspace.load(scene)
     assert written.gravity is not None  # kept
     assert written.joint_offsets is not None
+    assert written.offsets_of == "panda"
     assert written.T_link_camera is not None
     assert written.joint_offsets[4] == pytest.approx(0.011, abs=0.002)
     assert np.linalg.norm(written.T_link_camera[:3, 3]) == pytest.approx(0.14, abs=0.02)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
 
 from splatbot.collision import RobotSpheres
-from splatbot.errors import InputError
+from splatbot.errors import FormatError, InputError
 from splatbot.gaussians import GaussianModel, Snapshot
 from splatbot.planning import MotionRefusedError, time_path
 from splatbot.protocols import Array
@@ -25,7 +26,7 @@ from splatbot.workspace import Workspace
 from tests.unit.planning.test_timing import path_of
 
 OFFSETS = np.array([0.3, -0.02, 0.01, 0.015, -0.03, 0.02, 0.01])
-SCENE = Workspace(T_world_base=np.eye(4), joint_offsets=OFFSETS)
+SCENE = Workspace(T_world_base=np.eye(4), joint_offsets=OFFSETS, offsets_of="panda")
 
 
 def ball_at(point: Array) -> Snapshot:
@@ -80,10 +81,39 @@ def test_a_scene_without_offsets_leaves_the_robot_and_one_of_another_robot_is_re
     for scene in (None, Workspace(), Workspace(joint_offsets=np.zeros(7))):
         assert robot_in_scene(panda(), scene) is panda()
     with pytest.raises(InputError, match="joint_offsets: has 6 values") as raised:
-        robot_in_scene(panda(), Workspace(joint_offsets=np.full(6, 0.01)))
+        robot_in_scene(panda(), Workspace(joint_offsets=np.full(6, 0.01), offsets_of="panda"))
     assert "panda has 7 joints" in str(raised.value.hint)
     with pytest.raises(InputError, match=r"panda_joint4 is 3\.1, more than its range"):
-        robot_in_scene(panda(), Workspace(joint_offsets=np.array([0, 0, 0, 3.1, 0, 0, 0])))
+        robot_in_scene(panda(), replace(SCENE, joint_offsets=np.array([0, 0, 0, 3.1, 0, 0, 0])))
+
+
+@pytest.mark.parametrize("name", ["iiwa14", "iiwa14-2f85", "xarm7", "ur5e"])
+def test_offsets_of_an_arm_are_refused_for_another_one_of_any_number_of_joints(name: str) -> None:
+    with pytest.raises(InputError, match="joint_offsets: are those of panda, not " + name.removesuffix("-2f85")):
+        robot_in_scene(load_robot(name), SCENE)
+
+
+def test_offsets_of_an_arm_apply_with_every_hand_on_it() -> None:
+    for name, arm in (("panda-2f85", "panda"), ("panda-2f140", "panda"), ("xarm7-panda_hand", "xarm7")):
+        robot = load_robot(name)
+        found = robot_in_scene(robot, replace(SCENE, offsets_of=arm))
+        np.testing.assert_allclose(found.fk(robot.home), robot.fk(robot.home + OFFSETS), atol=1e-12)
+
+
+def test_offsets_of_an_unnamed_arm_are_refused_with_the_line_to_add(tmp_path: Path) -> None:
+    replace(SCENE, offsets_of="").save(tmp_path / "scene.yaml")
+    with pytest.raises(InputError, match="offsets_of: does not name the arm") as raised:
+        robot_in_scene(load_robot("panda-2f85"), Workspace.load(tmp_path / "scene.yaml"))
+    assert "add offsets_of: panda if" in str(raised.value.hint)
+    with (tmp_path / "scene.yaml").open("a") as file:
+        file.write("offsets_of: panda\n")
+    scene = Workspace.load(tmp_path / "scene.yaml")
+    np.testing.assert_allclose(robot_in_scene(panda(), scene).fk(panda().home), panda().fk(panda().home + OFFSETS))
+    scene.save(tmp_path / "scene.yaml")
+    assert Workspace.load(tmp_path / "scene.yaml").offsets_of == "panda"
+    (tmp_path / "scene.yaml").write_text("offsets_of: 3\n")
+    with pytest.raises(FormatError, match="offsets_of: is 3"):
+        Workspace.load(tmp_path / "scene.yaml")
 
 
 def test_a_motion_that_is_free_at_the_reported_positions_alone_does_not_pass_the_gate() -> None:
