@@ -136,6 +136,15 @@ class TransformBuffer:
             up, down = self._down(target, common), self._down(source, common)
             return _relative(up, down, {child: self._edges[child].pose(-1) for child in (*up, *down)})
 
+    def fixed(self, target: str, source: str) -> Array | None:
+        """Return T_target_source (4, 4) [m] by static transforms alone; None if these do not connect the frames."""
+        with self._changed:
+            common = self._common(target, source)
+            if common is None:
+                return None
+            way = (*self._down(target, common), *self._down(source, common))
+            return self.newest(target, source) if all(self._edges[child].static for child in way) else None
+
     def carrier(self, frame: str, links: Sequence[str]) -> str | None:
         """Return the first of the links on the way from a frame up to its root; None if no link carries the frame."""
         with self._changed:

@@ -269,8 +269,8 @@ class Runtime:
         return kept
 
     def find_transform(self, target: str, source: str) -> Array | None:
-        """Return the newest T_target_source (4, 4) [m] of clients' TF; None if nothing connects the frames."""
-        return self._robot_topics.transforms.newest(target, source)
+        """Return T_target_source (4, 4) [m] by clients' static TF; None if that does not connect the frames."""
+        return self._robot_topics.transforms.fixed(target, source)
 
     def _take_robot_news(self) -> None:
         for news in self._robot_news:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections import OrderedDict
 from collections.abc import Callable
 from typing import Any
@@ -30,6 +31,7 @@ DEPTH_INFO = "/camera/depth/camera_info"
 """Intrinsics of depth, where it is of another camera than colour."""
 MAX_PIXELS = 2_100_000  # of an image, unless the settings of the service say otherwise
 _WAITING = 16
+_WARN_EVERY_S = 10.0  # [s] between two warnings of one problem
 _WAITING_STATES = 2000  # 2 s of a robot at 1 kHz, while an image is decoded; also of its transforms
 
 _log = logging.getLogger(__name__)
@@ -62,6 +64,7 @@ class RosSubscribers:
     ) -> None:
         self._on_joints, self._on_robot, self._on_frame = on_joints, on_robot, on_frame
         self.dropped = 0
+        self._problems: dict[str, tuple[str, float, int]] = {}  # by topic: the last one, its time [s], its repetitions
         self._pairs = FramePairs(max_pixels, find_transform)
         register_moveit_types()
         graph.advertise(DEPTH_INFO, "sensor_msgs/msg/CameraInfo")
@@ -98,9 +101,19 @@ class RosSubscribers:
             except BusyError:
                 self.dropped += 1  # as a camera drops frames without a reader
             except SplatbotError as error:
-                _log.warning("%s from a client: %s", news.topic, error)
+                self._warn(news.topic, str(error))
             except Exception:  # one odd message must not end the others
                 _log.exception("%s from a client could not be used", news.topic)
+
+    def _warn(self, topic: str, problem: str) -> None:
+        """Log a refused message; equal problems of a topic once in 10 s, with their count."""
+        now, (last, since, count) = time.monotonic(), self._problems.get(topic, ("", 0.0, 0))
+        if problem == last and now - since < _WARN_EVERY_S:
+            self._problems[topic] = last, since, count + 1
+            return
+        more = f" ({count} more before)" if count else ""
+        _log.warning("%s from a client: %s%s", topic, problem, more)
+        self._problems[topic] = problem, now, 0
 
     def _take(self, topic: str, value: RosMessage) -> None:
         if topic == JOINTS:
@@ -141,7 +154,7 @@ class FramePairs:
             if topic == INFO:
                 self._cameras.color = camera
             else:
-                self._cameras.depth = camera
+                self._cameras.set_depth(camera, message.header.frame_id.strip("/"))
             return None
         self._check_size(*size_of(message))
         stamp, other = seconds_of(message.header.stamp), self._waiting[DEPTH if topic == COLOR else COLOR]
@@ -164,8 +177,9 @@ class FramePairs:
 
     def _frame(self, stamp: float, color: Any, depth: Any) -> Frame:
         color_frame, depth_frame = (message.header.frame_id.strip("/") for message in (color, depth))
-        pair = self._cameras.pair(color_frame, depth_frame)
-        rgb, z = pair.images(color_of(color), depth_of(depth))
+        colors, depths = color_of(color), depth_of(depth)
+        pair = self._cameras.pair(color_frame, depth_frame, same_size=colors.shape[:2] == depths.shape)
+        rgb, z = pair.images(colors, depths)
         self._count += 1
         return RosFrame(
             stamp,

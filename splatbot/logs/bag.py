@@ -197,12 +197,13 @@ class BagLog(StampedLog):
         cameras = RosCameras(self._static_transform)
         cameras.color = self._calibration.camera
         same_size = color_of(colors).shape[:2] == depth_of(depths).shape
-        if self._given.get("registered") == "1" or (same_size and depth_frame in ("", color_frame)):
-            return cameras.pair("", "")
-        info = next(iter(self._all(_info_of(self._depth))), None)
-        cameras.depth = None if info is None else self._checked(_info_of(self._depth), lambda: camera_of(info))
+        if self._given.get("registered") == "1":
+            return cameras.pair("", "", same_size=True)
+        topic = _info_of(self._depth)
+        if (info := next(iter(self._all(topic)), None)) is not None:
+            cameras.set_depth(self._checked(topic, lambda: camera_of(info)), info.header.frame_id.strip("/"))
         try:
-            pair = cameras.pair(color_frame, depth_frame)
+            pair = cameras.pair(color_frame, depth_frame, same_size=same_size)
         except InputError as error:
             raise LogError(error.message, file=self.path, field=self._depth, hint=f"{error.hint}; {hint}") from error
         if MASK in self._index and not pair.one:

@@ -14,7 +14,7 @@ from splatbot.logs.undistort import Undistorter
 from splatbot.protocols import Array
 
 FindTransform = Callable[[str, str], Array | None]
-"""Returns T_target_source (4, 4) [m] of two frames of TF, or None if nothing connects them."""
+"""Returns T_target_source (4, 4) [m] of two frames of TF, or None if no static transforms connect them."""
 
 
 class CameraPair:
@@ -65,44 +65,55 @@ class CameraPair:
 class RosCameras:
     """The cameras of colour and depth as their messages describe them, which may change.
 
+    Attributes:
+        color: colour camera, None while it is not known.
+
     Args:
-        find_transform: of TF, between the frames of two cameras.
+        find_transform: of TF, between the frames of two cameras on one mount.
     """
 
     def __init__(self, find_transform: FindTransform) -> None:
         self.color: Camera | None = None
-        self.depth: Camera | None = None
+        self._depth: tuple[str, Camera] | None = None
         self._find_transform = find_transform
         self._pair: CameraPair | None = None
 
-    def pair(self, color_frame: str, depth_frame: str) -> CameraPair:
+    def set_depth(self, camera: Camera, frame: str) -> None:
+        """Keep a camera_info of depth, whose header names a frame of TF."""
+        self._depth = frame, camera
+
+    def pair(self, color_frame: str, depth_frame: str, *, same_size: bool) -> CameraPair:
         """Return the pair for images whose headers name frames of TF; the colour camera is known.
 
-        Depth is of the colour camera if it names the same frame, or none, and has no other intrinsics.
+        Images of one size are of the colour camera if their frames are equal, or one is empty. Other depth has a camera
+        of its own: a camera_info of its frame, and its place by TF.
 
         Raises:
             InputError: depth is of another camera, and its intrinsics or its place are not known.
             CameraError: an image is too large.
         """
         assert self.color is not None  # of the caller
-        depth, T = self.depth or self.color, np.eye(4)
-        if color_frame and depth_frame and color_frame != depth_frame:
-            where = f"is of {depth_frame}, colour of {color_frame}"
-            if self.depth is None:
-                hint = (
-                    "publish camera_info of depth and TF between both, or depth registered to colour with its frame_id"
-                )
-                raise InputError(f"{where}, and depth has no camera_info.", field="depth", hint=hint)
-            found = self._find_transform(color_frame, depth_frame)
-            if found is None:
-                hint = "publish it on /tf_static, or depth that is registered to colour with its frame_id"
-                raise InputError(f"{where}, and TF does not connect them.", field="depth", hint=hint)
-            T = found
-        known = self._pair
-        if (
-            known is None
-            or (known.color, known.depth) != (self.color, depth)
-            or not np.array_equal(known.T_color_depth, T)
-        ):
-            known = self._pair = CameraPair(self.color, depth, T)
+        one_place = color_frame == depth_frame or not (color_frame and depth_frame)
+        if one_place and same_size:
+            return self._known(self.color, np.eye(4))
+        where = f"is of {depth_frame or 'no frame'}, colour of {color_frame or 'no frame'}"
+        if one_place and not (color_frame and depth_frame):
+            hint = "name the frame of its camera in the header of each image"
+            raise InputError(f"{where}, and of another size.", field="depth", hint=hint)
+        if self._depth is None or self._depth[0] not in ("", depth_frame):
+            known = "no camera_info" if self._depth is None else f"a camera_info of {self._depth[0]}"
+            hint = "publish its camera_info and TF between both, or depth registered to colour with its frame_id"
+            raise InputError(f"{where}, and depth has {known}.", field="depth", hint=hint)
+        T = np.eye(4) if one_place else self._find_transform(color_frame, depth_frame)
+        if T is None:
+            hint = "publish it on /tf_static, or depth that is registered to colour with its frame_id"
+            raise InputError(f"{where}, and static TF does not connect them.", field="depth", hint=hint)
+        return self._known(self._depth[1], T)
+
+    def _known(self, depth: Camera, T: Array) -> CameraPair:
+        """Return the pair of before if nothing changed, else a new one."""
+        known, color = self._pair, self.color
+        assert color is not None
+        if known is None or (known.color, known.depth) != (color, depth) or not np.array_equal(known.T_color_depth, T):
+            known = self._pair = CameraPair(color, depth, T)
         return known

@@ -40,7 +40,7 @@ def record(
         write("/cam/color/camera_info", "sensor_msgs/msg/CameraInfo", camera_info_message(1.0, CAMERA))
         write("/cam/color/image_raw", IMAGE, image_message(1.0, rgb, "color"))
         if depth_info is not None:
-            write("/cam/depth/camera_info", "sensor_msgs/msg/CameraInfo", camera_info_message(1.0, depth_info))
+            write("/cam/depth/camera_info", "sensor_msgs/msg/CameraInfo", camera_info_message(1.0, depth_info, "depth"))
         z = np.ones((H // size, W // size), np.float32)
         write("/cam/depth/image_rect_raw", IMAGE, image_message(1.0, z, depth_frame))
     return str(path)

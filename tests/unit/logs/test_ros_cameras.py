@@ -27,9 +27,11 @@ def ramp(camera: Camera) -> NDArray[np.uint8]:
     return np.stack([u, 2 * v, np.full_like(u, 7)], axis=-1).astype(np.uint8)
 
 
-def cameras(find: dict[tuple[str, str], Array], *, depth: Camera | None = DEPTH) -> RosCameras:
+def cameras(find: dict[tuple[str, str], Array], *, depth: Camera | None = DEPTH, frame: str = "depth") -> RosCameras:
     found = RosCameras(lambda target, source: find.get((target, source)))
-    found.color, found.depth = COLOR, depth
+    found.color = COLOR
+    if depth is not None:
+        found.set_depth(depth, frame)
     return found
 
 
@@ -50,9 +52,9 @@ def test_each_depth_pixel_has_the_colour_of_its_projection_into_the_distorted_co
 
 def test_images_of_one_camera_stay_as_they_are() -> None:
     rgb, z = ramp(COLOR), np.ones((96, 132), np.float32)
-    for frames in (("", ""), ("a", "a"), ("", "a")):
-        for depth in (None, COLOR):
-            pair = cameras({}, depth=depth).pair(*frames)
+    for frames in (("", ""), ("a", "a"), ("", "a"), ("a", "")):
+        for depth in (None, COLOR, DEPTH):  # a driver that aligns depth may also publish the camera_info of raw depth
+            pair = cameras({}, depth=depth).pair(*frames, same_size=True)
             found = pair.images(rgb, z)
             assert pair.camera == COLOR
             assert found[0] is rgb
@@ -60,7 +62,7 @@ def test_images_of_one_camera_stay_as_they_are() -> None:
 
 
 def test_depth_of_another_size_in_the_same_frame_is_a_second_camera_at_the_same_place() -> None:
-    pair = cameras({}, depth=COLOR.resized(66, 48)).pair("a", "a")
+    pair = cameras({}, depth=COLOR.resized(66, 48), frame="a").pair("a", "a", same_size=False)
     rgb, _ = pair.images(ramp(COLOR), np.ones((48, 66), np.float32))
     assert pair.camera == COLOR.resized(66, 48)
     np.testing.assert_allclose(rgb[..., 0], np.mgrid[:48, :66][1] * 2 + 0.5, atol=0.51)
@@ -69,22 +71,28 @@ def test_depth_of_another_size_in_the_same_frame_is_a_second_camera_at_the_same_
 def test_the_transform_between_the_frames_counts_and_the_pair_is_kept_until_something_changes() -> None:
     found = {("color", "depth"): T_COLOR_DEPTH}
     known = cameras(found)
-    pair = known.pair("color", "depth")
+    pair = known.pair("color", "depth", same_size=False)
     np.testing.assert_array_equal(pair.T_color_depth, T_COLOR_DEPTH)
-    assert known.pair("color", "depth") is pair
+    assert known.pair("color", "depth", same_size=False) is pair
     found["color", "depth"] = np.eye(4)
-    moved = known.pair("color", "depth")
+    moved = known.pair("color", "depth", same_size=False)
     assert moved is not pair
-    known.depth = DEPTH.resized(32, 24)
-    assert known.pair("color", "depth").camera == DEPTH.resized(32, 24)
+    known.set_depth(DEPTH.resized(32, 24), "depth")
+    assert known.pair("color", "depth", same_size=False).camera == DEPTH.resized(32, 24)
 
 
 def test_depth_of_another_camera_is_refused_where_its_intrinsics_or_its_place_are_not_known() -> None:
     with pytest.raises(InputError, match="depth: is of depth_optical, colour of color_optical, and depth") as one:
-        cameras({}, depth=None).pair("color_optical", "depth_optical")
+        cameras({}, depth=None).pair("color_optical", "depth_optical", same_size=True)
     assert "camera_info" in str(one.value.hint)
     with pytest.raises(InputError, match="TF does not connect") as other:
-        cameras({}).pair("color_optical", "depth_optical")
+        cameras({}, frame="depth_optical").pair("color_optical", "depth_optical", same_size=True)
     assert "/tf_static" in str(other.value.hint)
+    with pytest.raises(InputError, match="has a camera_info of depth"):  # of raw depth, not of these images
+        cameras({}).pair("color_optical", "aligned", same_size=True)
+    for frames in (("", ""), ("a", "")):
+        with pytest.raises(InputError, match="of another size"):
+            cameras({}).pair(*frames, same_size=False)
+    pair = cameras({}, frame="a").pair("a", "a", same_size=False)
     with pytest.raises(InputError, match="depth image: is 132x96, its camera_info 64x48"):
-        cameras({}).pair("", "").images(ramp(COLOR), np.ones((96, 132), np.float32))
+        pair.images(ramp(COLOR), np.ones((96, 132), np.float32))

@@ -136,6 +136,19 @@ def test_a_frame_that_changes_its_parent_starts_over() -> None:
     assert known.carrier("cup", ["base"]) is None
 
 
+def test_fixed_transforms_are_those_of_static_edges_alone() -> None:
+    known = buffer(
+        stamped("mount", "color", 0.0, 0.1, static=True),
+        stamped("mount", "depth", 0.0, 0.3, static=True),
+        stamped("mount", "pan", 0.0, 0.5),
+    )
+    found = known.fixed("color", "depth")
+    assert found is not None
+    np.testing.assert_allclose(found[:3, 3], [0.2, 0, 0], atol=1e-12)
+    assert known.fixed("color", "pan") is None
+    assert known.fixed("color", "elsewhere") is None
+
+
 def test_memory_is_bounded_in_frames_time_and_size() -> None:
     known = TransformBuffer()
     known.add(stamped("base", f"f{k}", 0.0, static=True) for k in range(MAX_FRAMES + 100))

@@ -183,6 +183,19 @@ def test_images_of_a_client_become_frames_and_joint_states_are_taken(make_log: M
         assert b.camera_frame == "camera"
 
 
+def test_a_problem_of_many_messages_is_logged_once(make_log: MakeLog, caplog: pytest.LogCaptureFixture) -> None:
+    graph, frame, states = RosGraph(), open_log(make_log())[0], list[JointState]()
+    inlets = RosSubscribers(graph, states.append, lambda *_: None, on_frame=lambda _: None)
+    graph.publish(INFO, camera_info_message(frame.stamp, frame.camera), client=1)
+    inlets.start()
+    for k in range(5):
+        graph.publish(COLOR, image_message(float(k), frame.rgb, "color"), client=1)
+        graph.publish(DEPTH, image_message(float(k), frame.depth, "depth"), client=1)
+    _until(lambda: "depth has no camera_info" in caplog.text or None)
+    inlets.stop()
+    assert caplog.text.count("depth has no camera_info") == 1
+
+
 def test_images_without_a_partner_or_intrinsics_wait_and_are_forgotten_in_the_end(make_log: MakeLog) -> None:
     pairs, frame = FramePairs(), open_log(make_log())[0]
     assert pairs.add(COLOR, image_message(0.0, frame.rgb)) is None
