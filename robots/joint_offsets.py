@@ -62,6 +62,7 @@ def _with_offsets(robot: RobotModel, offsets: tuple[float, ...]) -> RobotModel:
         gripper=hand,
         covering=robot.link_spheres,
         pairs=robot.self_collision_pairs,
+        joint_offsets=offsets,
     )
 
 

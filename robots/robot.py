@@ -103,6 +103,8 @@ class RobotModel:
         pairs: (M, 2) links that may not touch. If None, they are derived from the spheres.
         visual: visual meshes of links, for pictures alone.
         link_frames: frames of the links in TF; None if its description does not name them.
+        joint_offsets: (J,) offsets that ``joints`` include, of :func:`splatbot.robots.joint_offsets.robot_in_scene`
+            [rad or m]; empty without them.
 
     Raises:
         InputError: joints, home, shapes and frames are inconsistent.
@@ -121,6 +123,7 @@ class RobotModel:
     pairs: NDArray[np.int32] | None = field(default=None, repr=False)
     visual: tuple[Mesh, ...] = field(default=(), repr=False)
     link_frames: LinkFrames | None = field(default=None, repr=False)
+    joint_offsets: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         if len(self.home) != len(self.joints):

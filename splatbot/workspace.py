@@ -206,6 +206,12 @@ class Workspace:
             file.write(yaml.safe_dump(document, sort_keys=False, default_flow_style=None).encode())
 
 
+def same_offsets(one: ArrayLike, other: ArrayLike) -> bool:
+    """Return whether two arms have the same joint offsets (J,) [rad or m], to the digits of a ``scene.yaml``."""
+    a, b = np.asarray(one, np.float64), np.asarray(other, np.float64)
+    return a.shape == b.shape and bool(np.abs(a - b).max(initial=0.0) <= 1e-6)
+
+
 def find_workspace(*places: str | Path | None) -> Workspace | None:
     """Return the first ``scene.yaml`` in the given folders or next to the given files, or None.
 

@@ -160,7 +160,9 @@ def grasp(
     folder = out if out is not None else Path("runs") / "grasp"
     folder.mkdir(parents=True, exist_ok=True)
     with atomic_write(folder / "grasp.json") as handle:
-        content = grasp_file(result, sampler, map_file(map), robot=arm.name, unknown=unknown)
+        content = grasp_file(
+            result, sampler, map_file(map), robot=arm.name, joint_offsets=arm.joint_offsets, unknown=unknown
+        )
         handle.write(json.dumps(content, indent=2).encode())
     shown = next(iter((*result.grasps, *result.doubtful)), result.best_rejected)
     if shown is not None:

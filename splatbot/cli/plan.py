@@ -133,6 +133,7 @@ def plan(
     elif grasp is not None:
         known = GraspFile.load(grasp)
         known.check_robot(arm.name, T_world_base)
+        known.check_offsets(arm.joint_offsets)
         wanted = known.grasp(grasp_index, len(arm)).q_pregrasp
     else:
         wanted = joint_values(goal or (), arm, "--goal")
@@ -262,6 +263,7 @@ def _summary(
     c = trajectory.certificate
     return {
         "robot": arm.name,
+        "joint_offsets": list(arm.joint_offsets),
         "joint_names": list(trajectory.names),
         "T_world_base": pose_values(T_world_base),
         "status": result.status.name,

@@ -87,6 +87,7 @@ def plan_pick(
     )
     known = GraspFile.load(grasp)
     robot = robot_in_scene(load_robot(known.robot), find_workspace(map))
+    known.check_offsets(robot.joint_offsets)
     grasps = known.result(grasp_index, len(robot))
     here = joint_values(start, robot, "--start")
     known.check_map(file)
@@ -161,6 +162,7 @@ def _summary(picked: MapPick, known: GraspFile) -> dict[str, Any]:
     result = picked.result
     return {
         "robot": known.robot,
+        "joint_offsets": known.joint_offsets.tolist(),
         "T_world_base": pose_values(known.T_world_base),
         "target": known.target.label,
         "execute": bool(picked),

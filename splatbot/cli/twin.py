@@ -13,10 +13,11 @@ import tyro
 from splatbot.cli.drawing import CAMERA, draw_offscreen, film
 from splatbot.cli.paths import check_file, check_output
 from splatbot.cli.placing import Pose, checked_pose
-from splatbot.errors import InputError
+from splatbot.errors import FormatError, InputError
 from splatbot.layouts import map_file
 
 if TYPE_CHECKING:
+    from splatbot.robots.robot import RobotModel
     from splatbot.sim.ledger import LedgerEntry
     from splatbot.sim.recording import TwinRecording
     from splatbot.sim.scene import Scene
@@ -104,6 +105,8 @@ def twin(
     motion = None
     if trajectory is not None and it.world.robot is not None:
         motion = load_motion(trajectory, it.world.robot)
+        if map is not None:
+            _check_offsets(trajectory, it.world.robot)
     with film(video, it.world, seed) as shown, _progress(quiet) as show:
         recording = TwinRecording(it.world) if html is not None else None
         result = it.follow(motion, progress=show, watch=_watchers(shown, recording))
@@ -134,6 +137,33 @@ def _scene(name: str | None, map: Path | None, base: Pose | None, *, with_camera
     if with_camera:
         values["camera"] = CAMERA
     return make_scene(values)
+
+
+def _check_offsets(trajectory: Path, arm: RobotModel) -> None:
+    """Check that a plan or a motion of a pick is of the present calibration of an arm.
+
+    The file of another program has no plan.json or pick.json next to it. Its positions are those that the arm reports.
+
+    Raises:
+        FormatError: the file of the plan is damaged, or of another calibration.
+    """
+    import json as text
+
+    from splatbot.workspace import same_offsets
+
+    file = trajectory.with_name("plan.json" if trajectory.stem == "trajectory" else "pick.json")
+    if not file.is_file():
+        return
+    hint = "plan again, in this map"
+    try:
+        planned = text.loads(file.read_text())["joint_offsets"]
+        same = same_offsets(planned, arm.joint_offsets)
+    except (ValueError, KeyError, TypeError) as error:
+        problem = f"does not name the joint offsets of its arm ({error!r})."
+        raise FormatError(problem, file=file, field="joint_offsets", hint=hint) from error
+    if not same:
+        problem = "differ from those of the scene: the arm was calibrated since."
+        raise FormatError(problem, file=file, field="joint_offsets", hint=hint)
 
 
 def _harm(scene: Scene, result: TwinResult) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from splatbot.grasping.sampler import GraspSampler
 from splatbot.grasping.summary import grasp_from, summary
 from splatbot.grasping.types import Grasp, GraspResult
 from splatbot.protocols import Array
+from splatbot.workspace import same_offsets
 
 _HINT = "give the grasp.json of `splatbot grasp`"
 _AGAIN = "search for grasps again, in this map"
@@ -31,6 +32,7 @@ class GraspFile:
     Args:
         path: the file.
         robot: name of the robot.
+        joint_offsets: (J,) offsets of its joints in the scene [rad or m]; empty without them.
         T_world_base: (4, 4) pose of its base [m].
         target: the target; its rows are those of the map without flying pixels.
         gaussians: number of rows of that map.
@@ -44,6 +46,7 @@ class GraspFile:
 
     path: Path
     robot: str
+    joint_offsets: Array
     T_world_base: Array
     target: Target
     gaussians: int
@@ -78,6 +81,7 @@ class GraspFile:
         return cls(
             path=path,
             robot=str(values["robot"]),
+            joint_offsets=np.array(values["joint_offsets"], dtype=np.float64),
             T_world_base=pose_from_quat(base["translation"], base["quaternion_wxyz"]),
             target=Target(
                 rows,
@@ -108,6 +112,16 @@ class GraspFile:
         if not np.allclose(self.T_world_base, T_world_base, rtol=0.0, atol=1e-6):
             hint = "give the --base of the grasps"
             raise InputError("is another base.", file=self.path, field="T_world_base", hint=hint)
+
+    def check_offsets(self, joint_offsets: Sequence[float]) -> None:
+        """Check that the grasps are of an arm with these joint offsets (J,) [rad or m].
+
+        Raises:
+            InputError: they are of an earlier calibration of the arm.
+        """
+        if not same_offsets(self.joint_offsets, joint_offsets):
+            text = "differ from those of the scene: the arm was calibrated since."
+            raise InputError(text, file=self.path, field="joint_offsets", hint=_AGAIN)
 
     def check_map(self, file: Path) -> None:
         """Check that the grasps are of a map's file.
@@ -152,7 +166,13 @@ class GraspFile:
 
 
 def grasp_file(
-    result: GraspResult, sampler: GraspSampler, map_file: Path, *, robot: str, unknown: UnknownPolicy
+    result: GraspResult,
+    sampler: GraspSampler,
+    map_file: Path,
+    *,
+    robot: str,
+    joint_offsets: Sequence[float],
+    unknown: UnknownPolicy,
 ) -> dict[str, Any]:
     """Return the content of a file of grasps as JSON values.
 
@@ -161,11 +181,13 @@ def grasp_file(
         sampler: with which it was made.
         map_file: the map.
         robot: name of the robot.
+        joint_offsets: (J,) offsets of its joints in the scene [rad or m]; empty without them.
         unknown: treatment of unknown space.
     """
     T = sampler.scene.T_world_base
     return summary(result) | {
         "robot": robot,
+        "joint_offsets": list(joint_offsets),
         "T_world_base": {"translation": T[:3, 3].tolist(), "quaternion_wxyz": rotation_to_quat(T[:3, :3]).tolist()},
         "margin_m": sampler.margin,
         "arm_margin_m": max(sampler.margin, sampler.arm_margin),

@@ -118,3 +118,18 @@ def test_rows_of_another_number_of_gaussians_are_refused(
 def test_a_rank_that_does_not_exist_is_refused(run: RunCommand, map_file: Path, grasps: Path) -> None:
     words = ("--map", map_file, "--grasp", grasps, "--grasp-index", 7)
     assert_refused(run("plan-pick", *words), "--grasp-index: is 7, of 3 grasps")
+
+
+def test_grasps_of_an_earlier_calibration_are_refused_by_plans_and_picks(
+    run: RunCommand, map_file: Path, grasps: Path, tmp_path: Path
+) -> None:
+    scene = map_file.with_name("scene.yaml")
+    Workspace(T_world_base=np.eye(4), joint_offsets=np.full(7, 0.01), offsets_of="panda").save(scene)
+    words = ("--map", map_file, "--grasp", grasps, "--out", tmp_path / "out")
+    for command in (("plan-pick",), ("plan", "--start", "home")):
+        assert_refused(run(*command, *words), "joint_offsets: differ from those of the scene")
+    values = json.loads(grasps.read_text())
+    assert values.pop("joint_offsets") == []
+    grasps.write_text(json.dumps(values))
+    assert_refused(run("plan-pick", *words), "is no file of grasps")
+    assert not (tmp_path / "out").exists()

@@ -6,15 +6,18 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from splatbot.bench.tabletop import tabletop
 from splatbot.robots.panda import panda
 from splatbot.sim.effects.physics import PHYSICS
 from splatbot.sim.effects.registry import EFFECTS
-from tests.unit.cli.conftest import RunCommand
+from splatbot.workspace import Workspace
+from tests.unit.cli.conftest import RunCommand, assert_refused
 
 pytest.importorskip("mujoco")
 
@@ -63,6 +66,25 @@ def test_a_plan_of_another_robot_at_another_base_runs_in_the_twin_of_the_map(run
     assert values["tracking"]["tcp"] < 1e-3
     assert clearance > 0.0
     assert values["clearance"]["value"] > 0.0
+
+
+def test_a_plan_of_an_earlier_calibration_does_not_run_in_the_twin_of_the_map(run: RunCommand, tmp_path: Path) -> None:
+    tabletop().gaussians(4000).save(tmp_path / "map.ply")
+    scene = Workspace(T_world_base=np.eye(4), joint_offsets=np.full(7, 0.01), offsets_of="panda")
+    scene.save(tmp_path / "scene.yaml")
+    of, goal = ("--map", tmp_path / "map.ply"), (0.3, -0.5, 0.0, -2.0, 0.0, 1.6, 0.8)
+    planned = run("plan", *of, "--start", "home", "--goal", *goal, "--speed", 1, "--out", tmp_path / "out")
+    assert planned.code == 0, planned.err
+    simulated = ("twin", *of, "--no-costs", "--trajectory", tmp_path / "out" / "trajectory.json")
+    assert run(*simulated).code == 0
+    replace(scene, joint_offsets=np.full(7, 0.02)).save(tmp_path / "scene.yaml")
+    for name in ("trajectory.json", "trajectory.csv"):
+        assert_refused(run(*simulated[:-1], tmp_path / "out" / name), "plan.json: joint_offsets: differ from those")
+    for text in ("{}", "[]", "{"):
+        (tmp_path / "out" / "plan.json").write_text(text)
+        assert_refused(run(*simulated), "plan.json: joint_offsets: does not name")
+    (tmp_path / "out" / "plan.json").unlink()
+    assert run(*simulated).code == 0  # of another program, in reported positions
 
 
 @pytest.mark.parametrize(

@@ -40,6 +40,7 @@ def grasp_file_values(*grasps: dict[str, Any], robot: str = "panda") -> dict[str
         "target": {"label": "red box", "backend": "rules", "score": 0.9, "gaussians": 3, "notes": []},
         "grasps": list(grasps),
         "robot": robot,
+        "joint_offsets": [],
         "T_world_base": STANDING,
         "margin_m": 0.0,
         "arm_margin_m": 0.01,
