@@ -15,6 +15,7 @@ from splatbot.logs import Log
 from splatbot.protocols import Array
 from splatbot.results.folder import RunFolder
 from splatbot.results.metrics import without_nan
+from splatbot.robots.joint_offsets import robot_in_scene
 from splatbot.robots.robot import RobotModel
 from splatbot.sim.compare.recorded import ArmRecord, BaseInMap, base_in_map, pose_gap, read_arm
 from splatbot.sim.compare.replay import Replay, find_knots, replay
@@ -120,7 +121,7 @@ def compare_log(
     Args:
         log: the recording, with the masks of the run.
         run: the run that mapped it.
-        robot: the twin's arm.
+        robot: the twin's arm by its manufacturer. The scene with its calibration gives the joint offsets.
         frames: number of evenly spaced frames to compare; 0 for all.
         on_progress: called with the current step and the completed fraction.
 
@@ -129,7 +130,8 @@ def compare_log(
         FormatError: a file of the run or of the log is damaged.
         LogError: a frame cannot be read.
     """
-    record, tracked = read_arm(log.uri), run.load_poses()
+    record, tracked = read_arm(log.uri, run.path), run.load_poses()
+    robot = robot_in_scene(robot, record.workspace)
     model = GaussianModel.load(run.map)
     stamps = _stamps(log, run)
     known = sorted(index for index in stamps if index < len(log))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -51,7 +51,7 @@ class ArmRecord:
         tool: T_base_tool at their own stamps. If None, they are not recorded.
         T_tool_camera: (4, 4) of the camera on the tool. If None, it is not known.
         joints: joint positions over time. If None, they are not recorded.
-        workspace: ``scene.yaml`` of the log, or an empty one.
+        workspace: scene of the log, with the mount and the joint offsets of one calibration.
     """
 
     tool: Trajectory | None = None
@@ -105,18 +105,38 @@ class ArmRecord:
         return ""
 
 
-def read_arm(folder: str | Path) -> ArmRecord:
-    """Read the arm's data from a log's folder; a log that is no folder has none.
+def read_arm(folder: str | Path, run: Path | None = None) -> ArmRecord:
+    """Read the arm's data from a log's folder; a log that is no folder has only a scene.
+
+    Args:
+        folder: the log.
+        run: folder of a run, whose ``scene.yaml`` counts before that of the log if it has a calibration of the arm.
 
     Raises:
         FormatError: a file is damaged.
         LogError: `joints.txt` is damaged.
     """
-    place = Path(folder)
+    place, scene = Path(folder), _calibrated(find_workspace(run) or Workspace(), find_workspace(folder) or Workspace())
     if not place.is_dir():
-        return ArmRecord()
+        return ArmRecord(workspace=scene)
     tool = Trajectory.load(place / TOOL_POSES) if (place / TOOL_POSES).exists() else None
-    return ArmRecord(tool, _mount(place / _INTRINSICS), find_joints(place), find_workspace(place) or Workspace())
+    return ArmRecord(tool, _mount(place / _INTRINSICS), find_joints(place), scene)
+
+
+def _calibrated(run: Workspace, log: Workspace) -> Workspace:
+    """Return the scene of a log with mount and joint offsets of one scene: of the first that has a mount, else offsets.
+
+    Hand-eye calibration estimates both together.
+    """
+    with_offsets = run if run.joint_offsets is not None else log
+    found = next((scene for scene in (run, log) if scene.T_link_camera is not None), with_offsets)
+    return replace(
+        log,
+        T_link_camera=found.T_link_camera,
+        camera_link=found.camera_link,
+        joint_offsets=found.joint_offsets,
+        offsets_of=found.offsets_of,
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -96,15 +96,12 @@ def _compare_log(
     from splatbot.cli.tables import print_table
     from splatbot.results.folder import RunFolder
     from splatbot.robots.in_view import reopen_log
-    from splatbot.robots.joint_offsets import robot_in_scene
     from splatbot.robots.store import load_robot
     from splatbot.sim.compare.log_twin import KIND, compare_log
     from splatbot.sim.compare.page import log_html, log_rows
-    from splatbot.workspace import find_workspace
 
     run = RunFolder(map)
-    arm = robot_in_scene(load_robot(robot), find_workspace(map))
-    found = compare_log(reopen_log(run, uri=log), run, arm, frames=frames, on_progress=tell)
+    found = compare_log(reopen_log(run, uri=log), run, load_robot(robot), frames=frames, on_progress=tell)
     _write(folder, "sim2real", json, found.to_dict(), log_html(found))
     if not quiet:
         print_table(log_rows(found), title=f"{KIND}: {found.log} against the twin of {found.map}")

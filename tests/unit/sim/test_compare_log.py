@@ -19,6 +19,7 @@ from splatbot.geometry import inverse, look_at, pose_from_quat, quat_multiply, r
 from splatbot.logs.raycast import RaycastScene, RaycastSurface
 from splatbot.logs.textures import Texture
 from splatbot.protocols import Array
+from splatbot.robots.joint_offsets import robot_in_scene
 from splatbot.robots.panda import panda
 from splatbot.sim.compare.recorded import ArmRecord, base_in_map, pose_gap, read_arm
 from splatbot.sim.compare.replay import BY_IK, RECORDED, find_knots, replay
@@ -27,6 +28,7 @@ from splatbot.sim.scene import make_scene
 from splatbot.sim.solids import BoxGeom, rotation_of, rpy_of
 from splatbot.sim.twin import Twin
 from splatbot.trajectory import Trajectory
+from splatbot.workspace import Workspace
 
 pytest.importorskip("mujoco")
 
@@ -212,6 +214,31 @@ def test_poses_beyond_the_arms_reach_are_counted_not_invented() -> None:
 def test_a_log_without_an_arm_has_no_knots(tmp_path: Path) -> None:
     assert find_knots(read_arm(tmp_path), [0.0, 1.0], panda()) is None
     assert read_arm("synthetic:tabletop").source == ""
+
+
+def test_the_mount_and_the_joint_offsets_come_from_one_scene(tmp_path: Path) -> None:
+    """The camera's pose is that of the manufacturer's last link at the true positions, and the mount of that scene."""
+    log, run = tmp_path / "log", tmp_path / "run"
+    log.mkdir()
+    run.mkdir()
+    q, moved = panda().home, np.eye(4)
+    moved[2, 3] = 0.05
+    (log / "joints.txt").write_text("\n".join(" ".join(map(str, (0.02 * k, *q))) for k in range(50)))
+    of_log = Workspace(T_link_camera=np.eye(4), joint_offsets=np.full(7, 0.02), offsets_of="panda")
+    of_log.save(log / "scene.yaml")
+    for scene, offset, mount in (
+        (None, 0.02, np.eye(4)),
+        (Workspace(T_world_base=np.eye(4)), 0.02, np.eye(4)),
+        (Workspace(joint_offsets=np.full(7, 0.3), offsets_of="panda"), 0.02, np.eye(4)),
+        (Workspace(T_link_camera=moved, joint_offsets=np.full(7, -0.03), offsets_of="panda"), -0.03, moved),
+        (Workspace(T_link_camera=moved), 0.0, moved),
+    ):
+        if scene is not None:
+            scene.save(run / "scene.yaml")
+        record = read_arm(log, run)
+        found = record.camera_at(0.5, robot_in_scene(panda(), record.workspace))
+        assert found is not None
+        np.testing.assert_allclose(found, panda().fk(q + offset)[-1] @ mount, atol=1e-9)
 
 
 def test_a_mount_that_is_no_pose_is_named(tmp_path: Path) -> None:
