@@ -195,7 +195,10 @@ def started(recipe: dict[str, Any], folder: Path) -> Iterator[Container]:
         until(has_its_root)
         yield Container(recipe, process, first[0])
     finally:
-        process.kill()
+        if process.poll() is None:  # the change of the user has undone --kill-child
+            for pid in first:
+                os.kill(pid, signal.SIGKILL)
+            process.kill()
         process.wait(10)
 
 
