@@ -185,6 +185,11 @@ class ViewerScene:
             handle.batched_positions, handle.batched_colors = centers.astype(np.float32), rgb
         self.display_robot(self._display)
 
+    def remove_robot(self) -> None:
+        """Remove the robot in all postures, and the path of its tool."""
+        self._balls, self._meshes = {}, {}
+        self._server.scene.remove_by_name("/robot")
+
     def display_robot(self, display: RobotDisplay) -> None:
         """Choose the layers of the robot that are visible."""
         self._display = display

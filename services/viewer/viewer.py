@@ -13,6 +13,7 @@ import torch
 
 from splatbot.camera import Camera
 from splatbot.collision import RobotSpheres
+from splatbot.errors import InputError
 from splatbot.frame import Frame
 from splatbot.gaussians import GaussianModel
 from splatbot.grasping.types import GraspResult
@@ -102,6 +103,7 @@ class Viewer:
         self._pose: Array | None = None
         self._arm: RobotSpheres | None = None
         self._robot: RobotModel | None = None
+        self._no_robot = ""
         self._clicked: list[Array] = []
         self._plan: JointTrajectory | None = None
         self._camera: Camera | None = None
@@ -261,20 +263,30 @@ class Viewer:
             self._scene.show_robot(self._arm, self._robot, news.joints.position, served.field)
 
     def _take_map(self, served: ServedMap) -> None:
-        first = self._served is None or self._served.snapshot is None
-        self._served = served
-        self._state.content = f"**{served.id}** {served.state}, version {served.map_version}"
-        if served.snapshot is None:
-            return
-        if first:
+        old, self._served = self._served, served
+        first = old is None or old.snapshot is None or old.generation != served.generation
+        if first and served.snapshot is not None:
+            self._place_robot(served)
             self._scene.look_at_all(served.snapshot.model)
-        if served.trajectory is not None and first:
+        self._state.content = f"**{served.id}** {served.state}, version {served.map_version}{self._no_robot}"
+        if first and served.trajectory is not None:
             self._scene.show_camera_path(served.trajectory, self._camera)
+
+    def _place_robot(self, served: ServedMap) -> None:
+        """Show the robot at home in a new map. Without a base, or in the scene of another arm, the map has no robot."""
+        self._scene.remove_robot()
+        self._arm = self._robot = self._plan = None
+        self._slider.disabled, self._no_robot = True, ""
         base = served.workspace.T_world_base if served.workspace is not None else None
-        if base is not None and self._arm is None:
+        if base is None:
+            return
+        try:
             self._robot = robot_in(served, self._robot_name)
-            self._arm = RobotSpheres(self._robot, T_world_base=base)
-            self._scene.show_robot(self._arm, self._robot, np.asarray(self._robot.home), served.field)
+        except InputError as error:
+            self._no_robot = f"\n\nno robot: {error}"
+            return
+        self._arm = RobotSpheres(self._robot, T_world_base=base)
+        self._scene.show_robot(self._arm, self._robot, np.asarray(self._robot.home), served.field)
 
     def _show_result(self, result: FrameResult) -> None:
         if result.T_world_camera is not None:
