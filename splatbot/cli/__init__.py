@@ -6,11 +6,15 @@ import importlib
 import inspect
 import os
 import shutil
+import signal
 import sys
 import textwrap
+import threading
 import traceback
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from types import FrameType
 from typing import Any, NamedTuple, TextIO
 
 from splatbot.cli.messages import print_message
@@ -123,7 +127,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(__version__)
         return 0
     try:
-        return int(_dispatch(words) or 0)
+        with _interrupts_while_libraries_load():
+            return int(_dispatch(words) or 0)
     except SplatbotError as error:
         if debug:
             traceback.print_exc()
@@ -145,6 +150,33 @@ def main(argv: Sequence[str] | None = None) -> int:
             traceback.print_exc()
         print_message("error", sentence)
         return 1
+
+
+@contextmanager
+def _interrupts_while_libraries_load() -> Iterator[None]:
+    """Make Ctrl-C end the process while a module is imported.
+
+    Native modules turn a KeyboardInterrupt of their initialization into an ImportError, or lose it. A command that
+    handles SIGINT itself, to keep its work, is not concerned.
+    """
+    main_thread = threading.current_thread() is threading.main_thread()
+    if not main_thread or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield
+        return
+    signal.signal(signal.SIGINT, _on_interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def _on_interrupt(number: int, frame: FrameType | None) -> None:
+    while frame is not None:
+        if frame.f_code.co_filename.startswith("<frozen importlib"):
+            os.write(2, b"interrupted\n")
+            os._exit(130)
+        frame = frame.f_back
+    raise KeyboardInterrupt
 
 
 def _print_warning(

@@ -111,7 +111,7 @@ class RosCameras:
         return self._known(self._depth[1], T)
 
     def _known(self, depth: Camera, T: Array) -> CameraPair:
-        """Return the pair of before if nothing changed, else a new one."""
+        """Return the current pair if nothing changed, else a new one."""
         known, color = self._pair, self.color
         assert color is not None
         if known is None or (known.color, known.depth) != (color, depth) or not np.array_equal(known.T_color_depth, T):

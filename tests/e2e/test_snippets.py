@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -65,6 +66,18 @@ def _formats(desk: Path) -> Names:
     return {}
 
 
+def _compact(desk: Path) -> Names:
+    GaussianModel.load(desk / "runs" / "desk" / "map.ply").save(desk / "scene.ply")
+    return {}
+
+
+def _merging(desk: Path) -> Names:
+    log = "synthetic:tabletop?frames=30&width=160&height=120"
+    assert main(["map", log, "--out", str(desk / "runs" / "monday"), "--no-report", "--quiet"]) == 0
+    shutil.copytree(desk / "runs" / "monday", desk / "runs" / "tuesday")
+    return {}
+
+
 def _grasping(desk: Path) -> Names:
     return {"snapshot": _table(), "T_world_base": np.eye(4), "panda": panda, "observers": None}
 
@@ -94,8 +107,10 @@ def _tracking(desk: Path) -> Names:
 
 
 CONTEXTS: dict[str, Callable[[Path], Names]] = {
+    "docs/guide/compact.md": _compact,
     "docs/guide/formats.md": _formats,
     "docs/guide/grasping.md": _grasping,
+    "docs/guide/merging.md": _merging,
     "docs/guide/picking.md": _picking,
     "docs/guide/planning.md": _planning,
     "docs/guide/tracking.md": _tracking,

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import signal
 import subprocess
 import sys
 from dataclasses import fields
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -134,3 +136,23 @@ def fail_with(monkeypatch: pytest.MonkeyPatch, error: BaseException) -> None:
         raise error
 
     monkeypatch.setattr("splatbot.cli.checks.all_checks", broken)
+
+
+def test_ctrl_c_while_a_library_loads_ends_the_program_whatever_the_library_does_with_it(tmp_path: Path) -> None:
+    (tmp_path / "native_like.py").write_text(
+        "import time\nprint('loading', flush=True)\n"
+        "try:\n    time.sleep(60)\nexcept BaseException:\n    raise ImportError('initialization failed')\n"
+    )
+    program = (
+        "import splatbot.cli as cli\n"
+        "cli.COMMANDS['info'] = cli._Command('native_like', 'info', '')\n"
+        "raise SystemExit(cli.main(['info']))"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", program], cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "loading\n"
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=30)
+    assert (process.returncode, err) == (130, "interrupted\n")

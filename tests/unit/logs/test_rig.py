@@ -132,5 +132,5 @@ def test_a_file_that_is_no_yaml_is_named(tmp_path: Path) -> None:
 
 def test_intrinsics_for_all_cameras_at_once_are_refused(tmp_path: Path) -> None:
     path = write(tmp_path, f'cameras: {{wrist: {{log: "{WRIST}"}}}}')
-    with pytest.raises(LogError, match="each camera has its own"):
+    with pytest.raises(LogError, match="each recording has its own"):
         open_log(path, camera="tum_fr1")
