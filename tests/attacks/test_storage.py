@@ -58,6 +58,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
     subprocess.run(["umount", "-l", disk], check=False)
 
 
+@pytest.mark.long
 def test_a_second_service_on_one_folder_is_refused_and_told_the_first_one_s_process(tmp_path: Path) -> None:
     with serving("--data", str(tmp_path)) as (process, client):
         assert client.get("/readyz").status_code == 200

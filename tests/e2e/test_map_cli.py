@@ -173,6 +173,7 @@ def test_an_interrupt_saves_what_was_mapped(sound_log: Path, tmp_path: Path, num
     assert len(GaussianModel.load(tmp_path / "run" / "map.ply")) == metrics["gaussians"]
 
 
+@pytest.mark.long
 def test_impatient_interrupts_lose_no_more_than_scores_and_report(sound_log: Path, tmp_path: Path) -> None:
     process = start(sound_log, tmp_path / "run")
     wait_for_frame(process)

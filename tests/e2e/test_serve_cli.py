@@ -108,6 +108,7 @@ def test_a_port_that_is_taken_is_named(map_file: Path) -> None:
         assert port in refused("--map", str(map_file), "--port", port)
 
 
+@pytest.mark.long
 def test_a_damaged_map_is_named(map_file: Path) -> None:
     map_file.write_bytes(map_file.read_bytes()[:-100])
     assert "map.ply" in refused("--map", str(map_file))

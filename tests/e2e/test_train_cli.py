@@ -48,6 +48,7 @@ def finish(process: subprocess.Popen[str]) -> tuple[int, str, str]:
     return process.returncode, out, err
 
 
+@pytest.mark.long
 def test_a_scene_becomes_a_map_with_scores_pictures_and_poses(scene: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     code, printed, err = finish(start(str(scene), "--iterations", "250", "--out", str(out)))

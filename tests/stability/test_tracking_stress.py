@@ -39,6 +39,7 @@ def run(name: str) -> StressFigures:
     return run_case(BY_NAME[name], FRAMES, WIDTH, small_config())
 
 
+@pytest.mark.long
 @ALL
 def test_no_frame_is_wrong_without_a_word(name: str) -> None:
     found = run(name)

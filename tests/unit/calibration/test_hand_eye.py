@@ -199,6 +199,7 @@ def printed(measured: BoardMeasurement, scale: float) -> BoardMeasurement:
     return replace(measured, views=tuple(BoardView(view.points / scale, view.pixels) for view in measured.views))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("eye_in_hand", [True, False])
 @pytest.mark.parametrize(("offsets", "scale"), [(np.zeros(7), 1.03), (OFFSETS, 0.9)])
 def test_a_board_of_another_scale_gives_it_and_the_camera_within_three_sigma(
@@ -266,6 +267,7 @@ def test_turns_about_one_point_do_not_determine_the_scale() -> None:
     assert found.scale is None or found.scale.refusal
 
 
+@pytest.mark.long
 def test_inverted_poses_and_a_wrong_square_are_refused() -> None:
     q, measured, _ = seen_board(20, np.zeros(7), 2, eye_in_hand=True)
     F = link_poses(q)

@@ -74,6 +74,7 @@ def test_a_wrong_value_of_a_sensor_is_named() -> None:
 BOARD = "charuco:10x14:0.07:0.04"
 
 
+@pytest.mark.long
 def test_images_of_a_board_give_a_camera_file_and_a_scene(run: RunCommand, tmp_path: Path, data_root: Path) -> None:
     images = data_root / "panda_charuco_32"
     answer = run("calibrate", "intrinsics", images, "--board", BOARD, "--out", tmp_path / "camera.json")
@@ -102,6 +103,7 @@ def test_recorded_poses_of_the_hand_do_without_a_robot(run: RunCommand, data_roo
     assert "joint" not in answer.out.replace("without joint offsets", "")
 
 
+@pytest.mark.long
 def test_a_board_that_is_described_too_small_keeps_the_camera_at_its_place(
     run: RunCommand, tmp_path: Path, data_root: Path
 ) -> None:

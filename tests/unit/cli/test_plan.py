@@ -32,6 +32,7 @@ def map_file(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.long
 def test_the_pregrasp_of_a_grasp_is_a_goal(run: RunCommand, map_file: Path, tmp_path: Path) -> None:
     file = tmp_path / "grasp.json"
     file.write_text(json.dumps(grasp_file_values(grasp_values(UPRIGHT), grasp_values(GOAL))))

@@ -41,6 +41,7 @@ def test_a_robot_that_is_not_there_is_named(run: RunCommand) -> None:
     assert "there is no robot 'nobody'" in answer.err
 
 
+@pytest.mark.long
 def test_a_name_is_replaced_only_on_purpose_and_a_hand_is_attached(
     run: RunCommand, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -223,6 +223,7 @@ def test_pixels_without_depth_show_no_free_space() -> None:
     assert RawDepth(((np.full_like(depth, np.nan), camera, T),), FLOOR, QUAD).unseen(hand, HAND).min() == 1.0
 
 
+@pytest.mark.long
 def test_a_finger_that_enters_unseen_space_is_not_offered() -> None:
     half = raw(TABLE, *OBJECTS.values(), turns=np.linspace(-0.4, 0.4, 6))
     result = grasps_with(half)
@@ -241,6 +242,7 @@ def test_a_finger_that_enters_unseen_space_is_not_offered() -> None:
     assert not every.doubtful
 
 
+@pytest.mark.long
 def test_an_implied_side_needs_more_free_space_at_the_pad(monkeypatch: pytest.MonkeyPatch) -> None:
     from splatbot.grasping import doubts
 

@@ -192,6 +192,7 @@ def test_a_carried_camera_has_no_pose_where_the_motion_of_the_first_one_is_unkno
     assert slam.process(replace(side, stamp=wrist()[1].stamp + 0.5)).verdict == "lost"  # a gap
 
 
+@pytest.mark.long
 def test_a_given_pose_stays_where_a_loop_closure_moves_other_keyframes() -> None:
     T = in_world(wrist(), table_pose())
     for camera in (CameraConfig(T_world_camera=pose_config(T)), estimated(T, fixed=True)):

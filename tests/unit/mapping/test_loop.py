@@ -160,6 +160,7 @@ def test_a_circuit_that_drifts_closes_without_a_gap() -> None:
     assert gap(closed, truth) < 0.6 * gap(open_, truth)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("end", [Slam.finish, Slam.close_loops])
 def test_a_loop_that_the_last_frame_has_found_is_closed_at_the_end(end: Callable[[Slam], None]) -> None:
     frames, truth = through_a_wrong_lens()

@@ -63,6 +63,7 @@ def test_the_extent_is_never_exceeded_and_is_reached() -> None:
         np.testing.assert_allclose(high, dense.max(axis=0), atol=1e-4)
 
 
+@pytest.mark.long
 def test_no_sphere_deviates_from_the_chords_by_more_than_stated() -> None:
     rng = np.random.default_rng(3)
     arm = RobotSpheres(panda())

@@ -88,6 +88,7 @@ def test_links_move_by_their_poses() -> None:
     assert CONSTANTS.samples >= 2
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", [*("panda", *ARMS), "panda-2f85", "panda-2f140", "ur5e-panda_hand", "ur5e-2f85"])
 @pytest.mark.parametrize("opening", [0.03])
 def test_drawn_meshes_lie_in_the_certified_body(name: str, opening: float) -> None:

@@ -67,6 +67,7 @@ def test_every_triangle_of_the_makers_geometry_is_proven_to_lie_in_the_spheres(n
     assert uncovered(_installed(name).shapes, load_robot(name).spheres()) <= 0
 
 
+@pytest.mark.long
 def test_an_arm_plans_among_obstacles_and_every_path_is_certified(name: str, rng: np.random.Generator) -> None:
     robot = load_robot(name)
     assert len(robot.spheres()) <= 400
@@ -77,6 +78,7 @@ def test_the_twin_holds_an_arm_at_home(name: str) -> None:
     assert_held_at_home(load_robot(name))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", [f"{name}-{hand}" for name, arm in ARMS.items() for hand in arm.hands])
 def test_an_arm_with_a_hand_finds_grasps_that_it_reaches(name: str) -> None:
     robot = load_robot(name)

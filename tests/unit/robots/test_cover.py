@@ -21,6 +21,7 @@ def _bottle() -> Mesh:
     return Mesh(1, mesh.vertices, mesh.triangles.astype(np.int64))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("slack", [0.01, 0.02])
 @pytest.mark.parametrize("shape", [BOX, _bottle()], ids=["box", "bottle"])
 def test_every_point_of_the_surface_is_covered_and_none_reaches_beyond_the_slack(

@@ -56,6 +56,7 @@ def _turned(text: str) -> str:
     return text
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("text", [_BOXES, _turned(_BOXES)], ids=["along y", "along x, closing below 0"])
 def test_a_gripper_of_boxes_has_the_sizes_of_its_file(tmp_path: Path, text: str) -> None:
     reading = read_hand(_file(tmp_path, text))

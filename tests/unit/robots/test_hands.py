@@ -109,6 +109,7 @@ def test_a_hand_that_is_not_known_is_refused_with_the_names_of_those_that_are() 
         find_hand("claw")
 
 
+@pytest.mark.long
 def test_frankas_hand_on_another_arm_is_that_of_the_panda(tmp_path: Path) -> None:
     robot, own = attach(read_urdf(ur5(tmp_path), tip="tool0").robot, franka_hand()), panda()
     assert robot.hand == own.hand
@@ -125,6 +126,7 @@ def _on_the_tool(robot: RobotModel, opening: float | None) -> NDArray[np.float64
     return np.c_[transform_points(inverse(robot.T_link_tcp), spheres.centers[own]), spheres.radii[own]]
 
 
+@pytest.mark.long
 def test_the_mass_of_a_hand_counts_in_the_twin(tmp_path: Path) -> None:
     inertials = tuple(Inertial(2.0, (0.0, 0.0, 0.05), 0.01 * np.eye(3)) for _ in range(7))
     arm = replace(read_urdf(ur5(tmp_path), tip="tool0").robot, inertials=inertials)

@@ -41,6 +41,7 @@ def log() -> WristLog:
     return static_log(12.0)
 
 
+@pytest.mark.long
 def test_the_delay_is_found_within_its_own_uncertainty(log: WristLog) -> None:
     delay = -0.04
     found = estimate_joint_delay(Late(log, delay), panda(), SCENE)

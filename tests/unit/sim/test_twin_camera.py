@@ -164,12 +164,14 @@ def test_the_sensors_effects_are_on_the_account_and_change_the_depth() -> None:
     assert noisy != ideal
 
 
+@pytest.mark.long
 def test_what_no_one_asked_the_sensor_for_is_never_called() -> None:
     ideal, chosen = run_drawing(_IDEAL)
     assert ideal == "[] [] []"
     assert chosen == "['exposure', 'exposure', 'exposure'] [('exposure', 3)] ['exposure']"
 
 
+@pytest.mark.long
 def test_a_late_frame_shows_the_past_with_the_joints_of_the_present() -> None:
     """Taken every 0.1 s and 0.15 s on the way: each is handed over at the second call after its own."""
     lines = run_drawing(_LATE)
@@ -177,12 +179,14 @@ def test_a_late_frame_shows_the_past_with_the_joints_of_the_present() -> None:
     assert lines[2:] == [f"{i} {i - 2} {0.1 * (i - 2) + 0.15:.2f} True True" for i in (2, 3, 4)]
 
 
+@pytest.mark.long
 def test_any_pinhole_anywhere_shows_a_ball_where_it_projects_to() -> None:
     u, v, true_u, true_v = map(float, run_drawing(_ANYWHERE)[0].split())
     assert u == pytest.approx(true_u, abs=0.2)
     assert v == pytest.approx(true_v, abs=0.2)
 
 
+@pytest.mark.long
 def test_a_robot_among_gaussians_is_in_front_exactly_where_it_is_nearer() -> None:
     """Against MuJoCo's segmentation of the true shapes; a wrong pixel lies on an outline, which is soft in a map."""
     overlap, astray = (np.array(line.split(), float) for line in run_drawing(_AMONG_GAUSSIANS))
@@ -202,6 +206,7 @@ def test_where_no_body_is_the_picture_is_as_good_as_the_maps_alone() -> None:
     assert np.abs(plain - composite).max() < 0.1
 
 
+@pytest.mark.long
 def test_the_gaussians_of_a_movable_object_move_with_it(tmp_path: Path) -> None:
     for line in run_drawing(_MOVED, str(tmp_path / "map.ply")):
         count, at, true = map(float, line.split())

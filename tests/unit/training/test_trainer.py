@@ -36,6 +36,7 @@ def trained(iterations: int, *, data: TrainingData | None = None, **options: Any
     return trainer, float(summary(scores)["psnr_db"])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("strategy", ["default", "absgrad", "mcmc", "fixed"])
 def test_held_out_views_are_explained(strategy: str) -> None:
     _, before = trained(1, strategy=strategy)
