@@ -281,6 +281,7 @@ def _summary(
 
 
 _BASE_IN_MAP = "NOT COVERED, AND PROBABLY WRONG: more of the mounted link than its foot is in the map; check --base"
+_BASE = "not covered: the mounted link is not checked, and an error of its pose moves the whole arm"
 _LONG_DETOUR = 2.0
 _DETOUR = "{:.1f} times the direct distance in joint space; a longer --budget-ms may shorten it"
 _CLOSE = "less than 2 mm beyond the margin; a larger --margin keeps the arm farther away"
@@ -317,7 +318,7 @@ def _print(
         *([] if nearest is None else [("nearest", str(nearest))]),
         *([("close", _CLOSE)] if nearest is not None and nearest.close else []),
         ("covers", f"moving links against the map at {covers['n_sigma']:g} sigma and against the arm itself"),
-        ("base", _BASE_IN_MAP if covers["base_in_map"] else "not covered: the mounted link is not checked"),
+        ("base", _BASE_IN_MAP if covers["base_in_map"] else _BASE),
         (
             "hand",
             "covered, with the gripper fully open"

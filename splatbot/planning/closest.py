@@ -63,7 +63,8 @@ class ClosestApproach:
     def __str__(self) -> str:
         away = f"{1e3 * self.clearance:.1f} mm beyond the margin from {self.obstacle}"
         place = place_words(self.at_base.tolist())
-        return f"{link_words(self.link, self.name)} at {self.time:.2f} s, {away} at {place}"
+        moment = f"{link_words(self.link, self.name)} at {self.time:.2f} s"
+        return f"of {CONSTANTS.moments} moments: {moment}, {away} at {place}"
 
     def to_dict(self) -> dict[str, Any]:
         """Return the moment as JSON values."""

@@ -258,8 +258,8 @@ def clearance_text(certificate: Certificate) -> str:
     """Describe the clearance of a trajectory's certificate, which is not computed beyond a cut."""
     least, margin = f"{1e3 * certificate.clearance:.1f} mm", f"beyond a margin of {1e3 * certificate.margin:.1f} mm"
     if certificate.clearance >= CONSTANTS.clearance_cut * (1 - 1e-9):
-        return f"{least} or more (farther is not measured) {margin}"
-    return f"at least {least} {margin}"
+        return f"at least {least} {margin} along the whole curve (the certificate looks no farther)"
+    return f"at least {least} {margin} along the whole curve"
 
 
 def min_clearance(arm: RobotSpheres, field: GaussianCollisionField, control: Array) -> float:
