@@ -10,7 +10,7 @@ from splatbot.logs.ros_frames import RosFrame
 from splatbot.mapping.selfmask import REACH, JointsUnknownError, SelfMask
 from splatbot.protocols import Array
 from splatbot.robots.link_frames import LinkFrames
-from splatbot.robots.robot import RobotModel
+from splatbot.robots.robot import RobotModel, joint_transform
 from splatbot.robots.tf_buffer import TransformBuffer
 
 _TILT = 0.05  # [rad] by which the axis of a joint in TF may differ from the model
@@ -36,14 +36,16 @@ class LinkPoses:
     def mask(self, mask: SelfMask, frame: Frame, stamp: float, wait_s: float = 0.0) -> Frame:
         """Return the frame with the robot at a stamp [s] removed from its mask; wait up to ``wait_s`` [s] for TF.
 
-        The pose of the camera is that of the mask. If the mask has none, it is that of the image's frame in TF.
+        The pose of the camera is that of the mask, and the links are moved by its joint offsets. If the mask has no
+        pose, it is that of the image's frame in TF, and the links are those of TF.
 
         Raises:
             JointsUnknownError: the poses of links or camera are not known at that time, or do not fit the model.
         """
         frames = self._named()
         if mask.has_camera:
-            return mask.at_poses(frame, self._at(frames, frames.names[0], stamp, wait_s))
+            reported = self._at(frames, frames.names[0], stamp, wait_s)
+            return mask.at_poses(frame, _at_true_positions(reported, self._robot, mask.joint_offsets))
         camera_frame = frame.camera_frame if isinstance(frame, RosFrame) else ""
         if not camera_frame:
             hint = "set header.frame_id of the images, or give T_link_camera (scene.yaml; robot of POST /v1/maps)"
@@ -70,3 +72,14 @@ class LinkPoses:
                 problem = f"{where} from the model of {self._robot.name}."
                 raise JointsUnknownError(problem, field="tf", hint=hint)
         return T
+
+
+def _at_true_positions(T: Array, robot: RobotModel, offsets: Array) -> Array:
+    """Return the poses (J + 1, 4, 4) at q + δ of links with poses T at reported positions q.
+
+    With the transform D of a joint, D(q + δ) = D(q) D(δ), so that T'_k+1 = T'_k T_k⁻¹ T_k+1 D(δ_k).
+    """
+    true = T.copy()
+    for k, joint in enumerate(robot.joints):
+        true[k + 1] = true[k] @ inverse(T[k]) @ T[k + 1] @ joint_transform(offsets[k], joint.prismatic)
+    return true

@@ -69,9 +69,9 @@ class SelfMask:
             raise InputError(
                 "is no rigid pose.", field="T_link_camera", hint="give (4, 4) with an orthonormal rotation"
             )
-        self._offsets = np.zeros(links - 1) if joint_offsets is None else np.asarray(joint_offsets, np.float64)
-        if self._offsets.shape != (links - 1,) or not np.isfinite(self._offsets).all():
-            shape = self._offsets.shape
+        self.joint_offsets = np.zeros(links - 1) if joint_offsets is None else np.asarray(joint_offsets, np.float64)
+        if self.joint_offsets.shape != (links - 1,) or not np.isfinite(self.joint_offsets).all():
+            shape = self.joint_offsets.shape
             raise InputError(f"is {shape}.", field="joint_offsets", hint=f"{robot.name} has {links - 1} joints")
         self._names = tuple(joint_names) or tuple(robot.chain.names)
         if len(self._names) != links - 1:
@@ -106,7 +106,7 @@ class SelfMask:
             hint = f"record the joints of {self._arm.robot.name} at 10 Hz or more, or map without its mask"
             raise JointsUnknownError("has no joints at its time.", file=where, field="joints", hint=hint)
         try:
-            q = select_joints(frame.joint_names, frame.joints, self._names) + self._offsets
+            q = select_joints(frame.joint_names, frame.joints, self._names) + self.joint_offsets
         except InputError as error:
             raise JointsUnknownError(error.message, file=where, field=error.field, hint=error.hint) from error
         return self._seen(frame, self._arm.forward(q)[0], None)

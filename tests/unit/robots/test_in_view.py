@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from splatbot.errors import LogError
-from splatbot.logs import Log
+from splatbot.logs import Log, open_log
 from splatbot.mapping.selfmask import SelfMask
 from splatbot.robots import in_view
 from splatbot.robots.in_view import open_without_robot
@@ -44,6 +45,23 @@ def test_delay_and_prefix_of_the_scene_count_in_tf(log: WristLog, tmp_path: Path
     assert "tf_prefix" in str(raised.value.hint)
     Workspace(tf_prefix="left_", joint_delay=0.3).save(path / NAME)
     check_masked(open_without_robot(str(path), "panda"), log)
+
+
+def test_joint_offsets_of_the_scene_move_the_links_of_tf_to_the_true_positions(log: WristLog, tmp_path: Path) -> None:
+    path = record_ros(tmp_path / "bag", log, joints_until=-1.0)
+    offsets = np.array([0.1, 0.06, -0.05, 0.08, 0.02, -0.06, 0.0])
+    scene = Workspace(T_link_camera=T_BASE_STATIC_CAMERA, camera_link=0, joint_offsets=offsets, offsets_of="panda")
+    scene.save(path / NAME)
+    plain = SelfMask(panda(), T_BASE_STATIC_CAMERA, link=0)
+    for masked, recorded, made in zip(open_without_robot(str(path), "panda"), open_log(str(path)), log, strict=True):
+        assert masked.joints is None
+        assert made.joints is not None
+        expected, reported = (
+            plain.at_poses(recorded, panda().fk(q)).mask for q in (made.joints + offsets, made.joints)
+        )
+        assert masked.mask is not None
+        assert (masked.mask != expected).mean() < 1e-3
+        assert (masked.mask != reported).mean() > 1e-2
 
 
 def test_joint_states_count_where_there_are_any_and_tf_elsewhere(log: WristLog, tmp_path: Path) -> None:
