@@ -16,6 +16,7 @@ from splatbot.logs.index import read_index
 from splatbot.logs.presets import PRESETS
 from splatbot.logs.synthetic import read_options
 from splatbot.services.problems import DISK_ERRORS, TooLargeError
+from splatbot.workspace import NAME as SCENE
 
 _SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".txt", ".json", ".yaml"})
 _MAX_FILES = 200_000
@@ -82,7 +83,8 @@ def unpack(
         progress: called with the share that is done, at least once per MiB; its exceptions end the work.
 
     Raises:
-        LogError: it is not a zip, is damaged, holds files of other kinds, or has paths that leave the archive.
+        LogError: it is not a zip, is damaged, holds files of other kinds, has paths that leave the archive, or has a
+            scene with joint offsets.
         TooLargeError: it unpacks to more than ``max_bytes``, an image has more than ``max_pixels``, or a list more
             than ``max_frames`` lines.
         CameraError: the intrinsics are damaged, or cannot be those of a camera.
@@ -118,7 +120,15 @@ def unpack(
         raise LogError("holds no rgb.txt.", field="upload", hint=hint)
     stays_inside(homes[0].parent)
     check_calibration(homes[0].parent, max_pixels)
+    _check_scene(homes[0].parent / SCENE)
     return homes[0].parent
+
+
+def _check_scene(file: Path) -> None:
+    """Refuse a scene with joint offsets. An uploaded map has no scene, so its plans would be for another arm."""
+    if file.is_file() and b"joint_offsets" in file.read_bytes():
+        hint = "copy the folder to a log root, and name it in POST /v1/maps; or delete the offsets"
+        raise LogError(f"has joint_offsets in {SCENE}, which an uploaded map does not keep.", field="upload", hint=hint)
 
 
 def stays_inside(folder: Path) -> None:

@@ -216,7 +216,8 @@ def _upload(service: Service, map_id: str, data: bytes) -> dict[str, object]:
 
 
 def test_an_uploaded_recording_is_mapped(open_: Service, tmp_path: Path) -> None:
-    job = _upload(open_, "sent", _zip(_recording(tmp_path)))
+    scene = b"gravity: [0.0, 0.0, -1.0]\n"
+    job = _upload(open_, "sent", _zip(_recording(tmp_path) | {"log/scene.yaml": scene}))
     assert job["state"] == "succeeded", job
     assert open_.client.get("/v1/maps/sent").json()["gaussians"] > 500
 
@@ -244,6 +245,7 @@ def test_uploads_that_mean_harm_fail_and_leave_nothing(open_: Service, tmp_path:
         "cut": (_zip(good)[:-500], "zip"),
         "no-zip": (b"PK\x03\x04" + b"\xff" * 500, "zip"),
         "no-images": (_zip(lists), ""),
+        "offsets": (_zip(good | {"log/scene.yaml": b"joint_offsets: [0.1]\n"}), "does not keep"),
     }
     for name, (data, told) in cases.items():
         job = _upload(open_, name, data)
