@@ -98,11 +98,15 @@ def align_maps(
         report: called with the finished share of the work.
 
     Raises:
-        InputError: the maps show no common place, or the located keyframes contradict each other.
+        InputError: B has too few keyframes, the maps show no common place, or the located keyframes contradict each
+            other.
     """
     chosen = _spread([k for k in keyframes_b if len(k.features)], CONSTANTS.keyframes)
     if not chosen or not any(len(k.features) for k in keyframes_a):
         raise InputError("a map has no keyframes with features.", field="keyframes", hint="map its log again")
+    if len(chosen) < CONSTANTS.least_agreeing:
+        few = f"B has {len(chosen)} keyframes, {CONSTANTS.least_agreeing} are needed."
+        raise InputError(few, field="keyframes", hint="record longer")
     frames = [prepare(_frame_of(keyframe), config.tracking) for keyframe in chosen]
     first: dict[int, MeasuredPose] = {}
     for done, (keyframe, prepared) in enumerate(zip(chosen, frames, strict=True)):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -66,7 +67,10 @@ def compare_runs(
         InputError: a run has several cameras, or B is not found in A.
     """
     a, b = load_run(run_a), load_run(run_b)
-    alignment = None if aligned else locate_run(a, b, lambda share: on_share("locating B in A", share))
+    alignment = None
+    if not aligned:
+        report, otherwise = partial(on_share, "locating B in A"), "; or give --aligned if both have one world"
+        alignment = locate_run(a, b, report, otherwise=otherwise)
     T_a_b = np.eye(4) if alignment is None else alignment.T_a_b
     views_a, views_b = _views(a, np.eye(4)), _views(b, T_a_b)
     sensors = (a.config.sensor, b.config.sensor)
@@ -77,7 +81,7 @@ def compare_runs(
         [keyframe.rgb.numpy() for keyframe in b.slam.keyframes],
         floor=max(sensor.sigma_depth_floor for sensor in sensors),
         quad=max(sensor.sigma_depth_quad for sensor in sensors),
-        report=lambda share: on_share("comparing depth", share),
+        report=partial(on_share, "comparing depth"),
     )
     return RunComparison(objects, alignment, [*views_a, *views_b])
 

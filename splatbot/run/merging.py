@@ -94,8 +94,15 @@ def load_run(run: str | Path) -> SavedRun:
     return saved
 
 
-def locate_run(a: SavedRun, b: SavedRun, report: Callable[[float], None] = lambda _share: None) -> MapAlignment:
+def locate_run(
+    a: SavedRun, b: SavedRun, report: Callable[[float], None] = lambda _share: None, *, otherwise: str = ""
+) -> MapAlignment:
     """Locate the map of run B in that of run A, see :func:`splatbot.mapping.alignment.align_maps`.
+
+    Args:
+        a, b: the runs.
+        report: called with the finished share.
+        otherwise: end of the hint of an error, a way that needs no alignment.
 
     Raises:
         InputError: B is not found in A.
@@ -103,7 +110,7 @@ def locate_run(a: SavedRun, b: SavedRun, report: Callable[[float], None] = lambd
     try:
         return align_maps(a.slam.keyframes, b.slam.keyframes, b.config, report)
     except InputError as error:
-        raise InputError(error.message, file=b.folder, field=error.field, hint=error.hint) from error
+        raise InputError(error.message, file=b.folder, field=error.field, hint=f"{error.hint}{otherwise}") from error
 
 
 @dataclass(frozen=True, eq=False)

@@ -67,7 +67,9 @@ def test_keyframes_that_contradict_each_other_are_refused() -> None:
     assert caught.value.field == "T_A_B"
 
 
-def test_a_map_without_features_is_refused() -> None:
+def test_maps_of_too_few_keyframes_are_refused() -> None:
     (a, _) = _mapped("tabletop", "")
+    with pytest.raises(InputError, match=r"B has 2 keyframes, 3 are needed\. Fix: record longer"):
+        align_maps(a, a[:2], CONFIG)
     with pytest.raises(InputError, match="no keyframes with features"):
         align_maps(a, [], CONFIG)
