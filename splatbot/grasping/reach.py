@@ -129,7 +129,7 @@ def hand_of(robot: RobotKinematics) -> HandShape:
     """
     hand = robot.hand if isinstance(robot, HasHand) else None
     if hand is None:
-        raise InputError("has no fingers.", field=robot.name, hint="take a robot with a gripper, as panda")
+        raise InputError("has no fingers.", field=robot.name, hint="take a robot with a gripper, as panda or ur5e-2f85 (`splatbot robot list` has all)")
     return hand
 
 
