@@ -64,6 +64,11 @@ check: $(WERROR_STAMP) ## ruff, mypy, layering contract, prose, and the native c
 figures: $(INSTALL_STAMP) ## run the commands behind the figures of the documentation, and compare (minutes; needs the test data)
 	$(BIN)/python -m tests.figures
 
+.PHONY: docs
+docs: export NO_MKDOCS_2_WARNING := 1
+docs: $(INSTALL_STAMP) ## the documentation as a site without a server: build/site/index.html
+	$(BIN)/mkdocs build --strict --config-file docs/site/mkdocs.yml
+
 .PHONY: clean
 clean: ## remove the virtual environment, build products and caches; runs/ is kept
 	rm -rf $(VENV) build dist .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis *.egg-info
