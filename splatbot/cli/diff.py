@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from splatbot.cli.paths import check_output, check_state
+from splatbot.cli.merge import check_runs, pose_rows
+from splatbot.cli.outputs import check_writable
+from splatbot.errors import InputError
 
 if TYPE_CHECKING:
     from splatbot.run.comparing import RunComparison
@@ -42,10 +44,11 @@ def diff(
         out: the picture; by default diff.png in the folder of B.
         quiet: no progress.
     """
-    for run in (a, b):
-        check_state(run)
+    check_runs(a, b)
     picture = out if out is not None else b / "diff.png"
-    check_output(picture, folder=False)
+    if picture.suffix.lower() != ".png":
+        raise InputError("is no PNG picture.", file=picture, field="--out", hint="end its name in .png")
+    check_writable(picture, folder=False)
 
     from splatbot.atomic import atomic_write
     from splatbot.cli.progress import shares
@@ -60,7 +63,7 @@ def diff(
     with atomic_write(picture) as handle:
         handle.write(changes_png(before, after, found.T_a_b, found.objects, found.views))
     if as_json:
-        print(json.dumps(found.summary(), indent=2, allow_nan=False))
+        print(json.dumps({**found.summary(), "picture": str(picture)}, indent=2, allow_nan=False))
         return 0
     _print(found)
     print(f"picture: {picture}")
@@ -70,7 +73,6 @@ def diff(
 def _print(found: RunComparison) -> None:
     from rich.table import Table
 
-    from splatbot.cli.merge import pose_rows
     from splatbot.cli.tables import print_columns, print_table, print_text
 
     if found.alignment is not None:
@@ -80,9 +82,9 @@ def _print(found: RunComparison) -> None:
         return
     table = Table("object", "change", "centre in A, m", "size, mm", title="changes", title_justify="left")
     for number, change in enumerate(found.objects, 1):
-        at = " ".join(f"{x:.2f}" for x in change.center)
+        at = " ".join(f"{x:z.2f}" for x in change.center)
         if change.previous is not None:
-            at = " ".join(f"{x:.2f}" for x in change.previous.center) + f" → {at}"
+            at = " ".join(f"{x:z.2f}" for x in change.previous.center) + f" → {at}"
         size = " x ".join(f"{1e3 * x:.0f}" for x in change.size)
         table.add_row(str(number), change.kind, at, size)
     print_columns(table)

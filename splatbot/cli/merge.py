@@ -8,7 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from splatbot.cli.paths import check_output, check_state
+from splatbot.cli.outputs import check_writable
+from splatbot.cli.paths import check_state
+from splatbot.errors import FormatError
+from splatbot.results.merge_output import check_merge
 
 if TYPE_CHECKING:
     from splatbot.mapping.alignment import MapAlignment
@@ -21,6 +24,7 @@ def merge(
     /,
     *,
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")],
+    overwrite: bool = False,
     no_report: bool = False,
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
     quiet: bool = False,
@@ -29,7 +33,8 @@ def merge(
 
     Several keyframes of B must agree on the pose of B in A; otherwise nothing is written. Surface of both is fused. A
     loses the surface that the depth of B sees through, and B adds the surface that A lacks. DIR is a run folder like
-    any other; its log plays both recordings (recordings.yaml). merge.json has the figures of the merge.
+    any other; its log plays both recordings (recordings.yaml). merge.json has the figures of the merge. After Ctrl-C
+    before the first map, a new DIR is removed.
 
     Examples:
         splatbot merge runs/monday runs/tuesday --out runs/both
@@ -39,13 +44,14 @@ def merge(
         a: a folder that `splatbot map` wrote, with its saved state.
         b: the later one.
         out: folder to write.
+        overwrite: replace the run that --out holds.
         no_report: write no audit, report.html and map.html, which take seconds.
         as_json: print merge.json.
         quiet: no progress and no summary.
     """
-    for run in (a, b):
-        check_state(run)
-    check_output(out)
+    check_runs(a, b)
+    check_merge(a, b, out, overwrite=overwrite)
+    check_writable(out, folder=True)
 
     from splatbot.cli.map_page import page_of_map
     from splatbot.cli.progress import progress_display, shares
@@ -54,12 +60,31 @@ def merge(
     with shares(quiet) as on_share:
         pair = align_runs(a, b, lambda share: on_share("locating B in A", share))
     with progress_display(quiet=quiet) as on_progress:
-        found = merge_runs(pair, out=out, on_progress=on_progress, map_page=page_of_map, report=not no_report)
+        found = merge_runs(
+            pair,
+            out=out,
+            on_progress=on_progress,
+            map_page=page_of_map,
+            report=not no_report,
+            overwrite=overwrite,
+        )
     if as_json:
         print(json.dumps(found.summary(), indent=2, allow_nan=False))
     elif not quiet:
         _print(out, found)
     return found.run.exit_code
+
+
+def check_runs(a: Path, b: Path) -> None:
+    """Check that both paths are folders of runs with a saved state.
+
+    Raises:
+        FormatError: one is a file, or has no saved state.
+    """
+    for name, run in (("A", a), ("B", b)):
+        if run.is_file():
+            raise FormatError("is a map file.", file=run, field=name, hint="give its run folder")
+        check_state(run)
 
 
 def pose_rows(alignment: MapAlignment) -> list[tuple[str, str]]:
@@ -69,8 +94,8 @@ def pose_rows(alignment: MapAlignment) -> list[tuple[str, str]]:
 
     moved, turned = alignment.sigmas
     return [
-        ("translation of B [m]", " ".join(f"{x:.4f}" for x in alignment.T_a_b[:3, 3])),
-        ("quaternion of B (wxyz)", " ".join(f"{x:.5f}" for x in rotation_to_quat(alignment.T_a_b[:3, :3]))),
+        ("translation of B [m]", " ".join(f"{x:z.4f}" for x in alignment.T_a_b[:3, 3])),
+        ("quaternion of B (wxyz)", " ".join(f"{x:z.5f}" for x in rotation_to_quat(alignment.T_a_b[:3, :3]))),
         ("standard deviation", f"{metres(moved)}, {degrees(turned)}"),
         ("keyframes of B", f"{len(alignment.located)} agree, {alignment.found} found, {alignment.tried} searched"),
     ]

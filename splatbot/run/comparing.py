@@ -17,6 +17,14 @@ from splatbot.protocols import Array
 from splatbot.run.merging import load_run, locate_run, pose_of
 from splatbot.run.state import SavedRun
 
+_SHARED_WORLD = {
+    "translation_m": [0.0, 0.0, 0.0],
+    "quaternion_wxyz": [1.0, 0.0, 0.0, 0.0],
+    "translation_sigma_m": None,
+    "rotation_sigma_rad": None,
+}
+"""Pose of B in A of runs that share a world; it is given, not estimated."""
+
 
 @dataclass(frozen=True, eq=False)
 class RunComparison:
@@ -43,7 +51,7 @@ class RunComparison:
         return {
             **{kind: kinds.count(kind) for kind in ("appeared", "removed", "moved")},
             "objects": [_row(number, change) for number, change in enumerate(self.objects, 1)],
-            "T_a_b": None if self.alignment is None else pose_of(self.alignment),
+            "T_a_b": _SHARED_WORLD if self.alignment is None else pose_of(self.alignment),
             "keyframes_agreeing": None if self.alignment is None else len(self.alignment.located),
         }
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,13 +25,14 @@ from splatbot.mapping.keyframes import Keyframe
 from splatbot.mapping.rigid_motion import move_gaussians, move_keyframe
 from splatbot.protocols import Array
 from splatbot.results.folder import RunFolder
+from splatbot.results.merge_output import RECORDINGS, check_merge
 from splatbot.run.job import RunResult, map_log
 from splatbot.run.outcome import MapPage
 from splatbot.run.progress import Progress
 from splatbot.run.state import Checkpoint, SavedRun
 from splatbot.slam import FrameResult, Slam
 
-RECORDINGS, SUMMARY = "recordings.yaml", "merge.json"
+SUMMARY = "merge.json"
 MAX_KEYFRAMES = 4000
 """Largest number of keyframes of the merged run: the images of as many at 640 x 480 take 9 GB."""
 
@@ -147,6 +149,7 @@ def merge_runs(
     on_progress: Callable[[Progress], None] | None = None,
     map_page: MapPage | None = None,
     report: bool = True,
+    overwrite: bool = False,
 ) -> MergedRun:
     """Merge two runs into the run folder ``out``.
 
@@ -156,18 +159,36 @@ def merge_runs(
 
     Args:
         aligned: the runs. Gaussians and keyframes of B are moved; the runs on disk stay as they are.
-        out: folder to write; must hold no run.
+        out: folder to write. If an error or Ctrl-C leaves it without a map, a folder that is new is removed.
         on_progress: called at every phase.
         map_page: makes a page of the finished map for the report. If None, the report has no such page.
         report: audit the merged map and write the report.
+        overwrite: replace the run that ``out`` holds.
 
     Raises:
         LogError: the recording of a run is missing.
-        InputError: ``out`` holds a run, or cannot be written.
+        InputError: A and B are one run, ``out`` is one of them or holds a run, or it cannot be written.
     """
-    a, b, alignment = aligned.a, aligned.b, aligned.alignment
-    _check_empty(Path(out))
+    check_merge(aligned.a.folder, aligned.b.folder, out, overwrite=overwrite)
     folder = RunFolder.create(out)
+    try:
+        return _merge_into(folder, aligned, on_progress, map_page, report=report)
+    except BaseException:  # Ctrl-C too
+        if folder.is_new and not folder.map.exists():
+            shutil.rmtree(folder.path)
+        raise
+
+
+def _merge_into(
+    folder: RunFolder,
+    aligned: AlignedRuns,
+    on_progress: Callable[[Progress], None] | None,
+    map_page: MapPage | None,
+    *,
+    report: bool,
+) -> MergedRun:
+    """Write the merged run."""
+    a, b, alignment = aligned.a, aligned.b, aligned.alignment
     time_offset = _write_recordings(folder.path / RECORDINGS, a, b)
     log = open_log(folder.path / RECORDINGS)
     slam, joined = _merged_slam(a, b, alignment, first_index=a.place.frames, time_offset=time_offset)
@@ -186,18 +207,17 @@ def merge_runs(
     Checkpoint(folder.path, 0.0).save(slam, loop, place, a.config)
     merged = SavedRun(folder.path, a.config, place, slam, loop)
     result = map_log(
-        log, out=out, resume=merged, on_progress=on_progress, map_page=map_page, report=report, source={"camera": None}
+        log,
+        out=folder.path,
+        resume=merged,
+        on_progress=on_progress,
+        map_page=map_page,
+        report=report,
+        source={"camera": None},
     )
     found = MergedRun(result, alignment, joined, time_offset)
     write_text(json.dumps(found.summary(), indent=2, allow_nan=False) + "\n")(folder.path / SUMMARY)
     return found
-
-
-def _check_empty(out: Path) -> None:
-    found = [name for name in ("map.ply", "metrics.json", "state", RECORDINGS) if (out / name).exists()]
-    if found:
-        hint = "name another folder"
-        raise InputError(f"holds a run already ({', '.join(found)}).", file=out, field="--out", hint=hint)
 
 
 def _check(a: SavedRun, b: SavedRun) -> None:

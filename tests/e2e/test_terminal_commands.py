@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -71,7 +72,7 @@ _WORDS = {
     ],
     "grasp": ["grasp", "--map", "{run}", "--target", "largest object", "--hand-only", "--out", "{out}/grasp"],
     "objects": ["objects", "{run}"],
-    "merge": ["merge", "{run}", "{run}", "--no-report", "--out", "{out}/merged"],
+    "merge": ["merge", "{run}", "{again}", "--no-report", "--out", "{out}/merged"],
     "diff": ["diff", "{run}", "{run}", "--out", "{out}/diff.png"],
     "export": ["export", "{run}", "--format", "points", "octomap", "--voxel", "0.05", "--out", "{out}/export"],
     "compact": ["compact", "{run}", "--sweep"],
@@ -86,7 +87,8 @@ _WORDS = {
 
 @pytest.mark.parametrize(("name", "columns", "colour"), [(n, c, c == 80) for n in _WORDS for c in (80, 200)])
 def test_a_command_fits_the_terminal(run_folder: Path, tmp_path: Path, name: str, columns: int, colour: bool) -> None:
-    words = [word.format(run=run_folder, out=tmp_path) for word in _WORDS[name]]
+    again = shutil.copytree(run_folder, tmp_path / "again") if name == "merge" else run_folder
+    words = [word.format(run=run_folder, again=again, out=tmp_path) for word in _WORDS[name]]
     environment = {} if colour else {"NO_COLOR": "1"}
     shown = at_a_terminal(*words, columns=columns, environment=environment)
     _assert_sound(shown, columns, (0, 1) if name in ("grasp", "plan") else (0,))

@@ -129,7 +129,7 @@ def test_wrong_runs_are_refused_and_nothing_is_written(
     with pytest.raises(FormatError):
         align_runs(tmp_path, runs[0])
     with pytest.raises(InputError, match="holds a run already"):
-        merge_runs(align_runs(runs[0], runs[0]), out=room)
+        merge_runs(align_runs(*runs), out=room)
     assert main(["diff", str(tmp_path), str(runs[0])]) == 2
 
 
