@@ -35,6 +35,7 @@ class ReachConstants:
 
 
 CONSTANTS = ReachConstants()
+_WITH_GRIPPER = "take a robot with a gripper, as panda or ur5e-2f85 (`splatbot robot list` has all)"
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +130,11 @@ def hand_of(robot: RobotKinematics) -> HandShape:
     """
     hand = robot.hand if isinstance(robot, HasHand) else None
     if hand is None:
-        raise InputError("has no fingers.", field=robot.name, hint="take a robot with a gripper, as panda or ur5e-2f85 (`splatbot robot list` has all)")
+        raise InputError(
+            "has no fingers.",
+            field=robot.name,
+            hint="take a robot with a gripper, as panda or ur5e-2f85 (`splatbot robot list` has all)",
+        )
     return hand
 
 
