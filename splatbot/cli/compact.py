@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import tyro
 
-from splatbot.cli.paths import check_output
+from splatbot.cli.outputs import check_new, check_writable
 from splatbot.errors import InputError
 from splatbot.formats import find_format
 from splatbot.layouts import map_file
@@ -36,6 +36,7 @@ def compact(
     cameras: Annotated[Path | None, tyro.conf.arg(metavar="RUN|TRAINING")] = None,
     log: Annotated[str | None, tyro.conf.arg(metavar="LOG")] = None,
     sweep: bool = False,
+    overwrite: bool = False,
 ) -> int:
     """Write a map of fewer Gaussians: groups of similar neighbours become one Gaussian each.
 
@@ -64,11 +65,16 @@ def compact(
         cameras: the run or training whose views give the importance; by default the one of MAP.
         log: where the recording of the run is now, if it was moved.
         sweep: print quality, size and clearance for shares of 1 to 0.1; write nothing.
+        overwrite: replace the file that --out names.
     """
     file = map_file(map)
     _check(file, out, keep, max_gaussians, sh_degree, sweep=sweep)
+    if out is not None:
+        check_new(out, overwrite=overwrite)
 
     from splatbot.cli.map_views import recorded_views
+    from splatbot.cli.progress import shares
+    from splatbot.cli.tables import print_text
     from splatbot.formats import load_gaussians
 
     model = load_gaussians(file)
@@ -76,10 +82,15 @@ def compact(
     if recorded is None and cameras is not None:
         hint = "give a folder that `splatbot map` or `splatbot train` wrote"
         raise InputError("is no run and no training.", file=cameras, field="--cameras", hint=hint)
-    print(f"importance from {_source(recorded)}")
-    weights = _weights(model, recorded)
+    print_text(f"importance from {_source(recorded)}")
     counts = _counts(len(model), keep, max_gaussians, sweep=sweep)
-    results = [_result(model, weights, count, sh_degree, recorded) for count in counts]
+    results: list[_Result] = []
+    with shares(quiet=False) as on_share:
+        on_share("rendering views", 0.0)
+        weights = _weights(model, recorded)
+        for done, count in enumerate(counts, 1):
+            on_share(f"{count:,} Gaussians", done / (len(counts) + 1))
+            results.append(_result(model, weights, count, sh_degree, recorded))
     _print(model, results, recorded)
     if out is not None:
         _save(results[0].model, out)
@@ -115,7 +126,7 @@ def _check(
     if sh_degree is not None and not 0 <= sh_degree <= 4:
         raise InputError(f"is {sh_degree}.", field="--sh-degree", hint="give 0 to 4")
     if out is not None:
-        check_output(out, folder=find_format(out).suffix == "_sog")
+        check_writable(out, folder=find_format(out).suffix == "_sog")
         if out.resolve() in (file.resolve(), file.resolve().parent):
             raise InputError("is the input.", file=out, field="--out", hint="name another file")
 
@@ -192,7 +203,7 @@ def _print(model: GaussianModel, results: list[_Result], recorded: MapViews | No
     for kept, scores, change in results:
         table.add_row(
             count(len(kept)),
-            percent(len(kept) / len(model)),
+            f"{100 * len(kept) / len(model):.3g} %",  # one of many Gaussians is not 0 %
             megabytes(kept.nbytes),
             decibels(scores.get("psnr_db")),
             number(scores.get("ssim"), 3),

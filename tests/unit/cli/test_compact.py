@@ -11,7 +11,8 @@ import pytest
 from splatbot.collision import GaussianCollisionField
 from splatbot.formats import load_gaussians
 from splatbot.formats.ply import save_ply
-from tests.unit.cli.conftest import RunCommand, assert_fix_named
+from tests.terminal import at_a_terminal
+from tests.unit.cli.conftest import RunCommand, assert_fix_named, assert_refused
 from tests.unit.formats.models import detailed_model
 
 
@@ -66,6 +67,30 @@ def test_a_sweep_has_a_row_for_each_share_and_writes_nothing(run: RunCommand, so
     assert answer.code == 0, answer.err
     assert re.findall(r"(\d+) %", answer.out)[::2] == ["100", "75", "50", "35", "25", "10"]
     assert list(source.parent.iterdir()) == [source]
+
+
+def test_an_existing_file_is_replaced_only_with_overwrite(run: RunCommand, source: Path) -> None:
+    words = ("compact", source, "--max-gaussians", 1, "--out", "one.ply")
+    first = run(*words)
+    assert first.code == 0, first.err
+    assert " 0.5 %" in first.out  # of 200 Gaussians
+    assert_fix_named(run(*words), "--overwrite")
+    assert run(*words, "--overwrite").code == 0
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs /proc, which takes no files, not even of root")
+def test_a_folder_that_takes_no_files_is_refused_before_the_map_is_read(run: RunCommand, source: Path) -> None:
+    source.write_bytes(b"no map")
+    assert_refused(run("compact", source, "--keep", "0.5", "--out", "/proc/a.ply"), "/proc/a.ply")
+    assert_refused(run("compare", source, source, "--out", "/proc/a.html"), "/proc/a.html")
+
+
+def test_a_narrow_terminal_gets_whole_lines_and_progress(source: Path) -> None:
+    shown = at_a_terminal("compact", str(source), "--sweep", columns=40)
+    assert shown.code == 0, shown.text
+    assert shown.live
+    assert "rendering views" in shown.text
+    assert shown.longest_line() <= 40
 
 
 @pytest.mark.parametrize(
