@@ -20,6 +20,7 @@ from splatbot.logs.ros_transforms import StampedTransform
 from splatbot.mapping.selfmask import JointsUnknownError, SelfMask
 from splatbot.protocols import RobotKinematics
 from splatbot.results.folder import RunFolder
+from splatbot.robots.joint_offsets import robot_in_scene
 from splatbot.robots.link_poses import LinkPoses
 from splatbot.robots.robot import RobotModel
 from splatbot.robots.store import load_robot
@@ -87,6 +88,7 @@ def open_without_robot(uri: str, robot: str | None, *, camera: str | None = None
     if log_kind(uri) == "rig":  # each camera has a mount of its own
         return RigLog(uri, lambda address, own: open_without_robot(address, robot, camera=own))
     model, workspace, file = load_robot(robot), find_workspace(uri) or Workspace(), f"{uri}/{NAME}"
+    robot_in_scene(model, workspace)  # refuses the joint offsets of another arm
     log = open_log(uri, camera=camera, joint_delay=workspace.joint_delay)
     links = recorded_links(model, {"": workspace}, log).get("")
     mask = self_mask(model, workspace, file=file, needs_camera=links is None)
