@@ -70,7 +70,7 @@ def test_drops_noise_a_stall_and_an_unplugged_device_cost_only_their_frames(log:
 
 def test_a_device_that_stays_away_ends_the_map_which_is_still_served(log: Log) -> None:
     with running(ServiceSettings(port=0, camera_wait_s=0.6)) as service:
-        results, details = follow(service, ReplayCamera(log, ReplayOptions(unplug=20)))
+        results, details = follow(service, ReplayCamera(log, ReplayOptions(unplug=20, speed=0.3)))
         assert details[-1] == "failed"
         assert 10 <= len(results) <= 20
         assert service.client.get("/v1/maps/camera").json()["gaussians"] > 500
