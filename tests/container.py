@@ -223,7 +223,10 @@ def _mounts(recipe: dict[str, Any], root: Path, folder: Path) -> Iterator[str]:
             yield f"ln -s {path.readlink()} {root}{path}"
         elif path.exists():
             yield _bind(path, f"{root}{path}")
-    if not python.is_relative_to("/usr"):
+    for mount in recipe["tmpfs"]:
+        target, options = mount.split(":")
+        yield f"mkdir -p {root}{target} && mount -t tmpfs -o {options} tmpfs {root}{target}"
+    if not python.is_relative_to("/usr"):  # these may lie in a folder of a tmpfs
         yield _bind(python, f"{root}{python}")
     yield _bind(ROOT, f"{root}{ROOT}")
     yield _bind(checkout, f"{root}/opt/splatbot")
@@ -233,9 +236,6 @@ def _mounts(recipe: dict[str, Any], root: Path, folder: Path) -> Iterator[str]:
     for device in _DEVICES:
         yield f"touch {root}/dev/{device} && mount --bind /dev/{device} {root}/dev/{device}"
     yield f"mkdir {root}/dev/shm && mount -t tmpfs -o size=64m,mode=1777 tmpfs {root}/dev/shm"
-    for mount in recipe["tmpfs"]:
-        target, options = mount.split(":")
-        yield f"mkdir -p {root}{target} && mount -t tmpfs -o {options} tmpfs {root}{target}"
     for volume in recipe["volumes"]:
         source, target, *options = volume.split(":")
         if source.startswith((".", "/")) and source != target:
