@@ -21,6 +21,7 @@ from splatbot.sim.compare.recorded import ArmRecord, BaseInMap, base_in_map, pos
 from splatbot.sim.compare.replay import Replay, find_knots, replay
 from splatbot.sim.compare.views import SeenView, Surroundings, TwinViews, ViewAgreement, surroundings
 from splatbot.sim.twin import Twin
+from splatbot.spacing import evenly_spaced
 from splatbot.workspace import Workspace, find_workspace, fit_workspace
 
 KIND = "sim-to-real"
@@ -226,9 +227,7 @@ def _stamps(log: Log, run: RunFolder) -> dict[int, float]:
 
 def _spread(items: Sequence[int], count: int) -> list[int]:
     """Return ``count`` evenly spaced items with both ends, or all items for 0."""
-    if count <= 0 or count >= len(items):
-        return list(items)
-    return [items[round(k)] for k in np.linspace(0, len(items) - 1, count)]
+    return evenly_spaced(items, count) if count > 0 else list(items)
 
 
 def _mean(values: Sequence[float | None]) -> float | None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import tyro
 
-from splatbot.cli.outputs import check_new, check_writable
+from splatbot.cli.paths import check_new, check_output
 from splatbot.errors import InputError
 from splatbot.formats import find_format
 from splatbot.layouts import map_file
@@ -126,7 +126,7 @@ def _check(
     if sh_degree is not None and not 0 <= sh_degree <= 4:
         raise InputError(f"is {sh_degree}.", field="--sh-degree", hint="give 0 to 4")
     if out is not None:
-        check_writable(out, folder=find_format(out).suffix == "_sog")
+        check_output(out, folder=find_format(out).suffix == "_sog")
         if out.resolve() in (file.resolve(), file.resolve().parent):
             raise InputError("is the input.", file=out, field="--out", hint="name another file")
 
@@ -146,11 +146,12 @@ def _source(recorded: MapViews | None) -> str:
 
 def _weights(model: GaussianModel, recorded: MapViews | None) -> Any:
     from splatbot.optimize.importance import blended_weights
-    from splatbot.training.map_views import around, spread
+    from splatbot.spacing import evenly_spaced
+    from splatbot.training.map_views import around
 
     if recorded is None:
         return blended_weights(model, around(model, _VIRTUAL_VIEWS))
-    views = spread(recorded.mapped, _MOST_VIEWS)
+    views = evenly_spaced(recorded.mapped, _MOST_VIEWS)
     return blended_weights(model, ((view.camera, view.T_world_camera) for view in views))
 
 

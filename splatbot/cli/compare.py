@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from splatbot.cli.outputs import check_writable
+from splatbot.cli.paths import check_output
 from splatbot.errors import InputError, SplatbotError
 from splatbot.layouts import map_file
 
@@ -56,7 +56,7 @@ def compare(
         raise InputError(f"is {views}.", field="--views", hint=f"give 1 to {_MOST_VIEWS}")
     if out.suffix.lower() not in (".html", ".htm"):
         raise InputError("is no HTML page.", file=out, field="--out", hint="end its name in .html")
-    check_writable(out, folder=False)
+    check_output(out, folder=False)
 
     from splatbot.atomic import replace_files, write_text
     from splatbot.formats import load_gaussians

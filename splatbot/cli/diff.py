@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from splatbot.cli.merge import check_runs, pose_rows
-from splatbot.cli.outputs import check_writable
+from splatbot.cli.paths import check_output
 from splatbot.errors import InputError
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def diff(
     picture = out if out is not None else b / "diff.png"
     if picture.suffix.lower() != ".png":
         raise InputError("is no PNG picture.", file=picture, field="--out", hint="end its name in .png")
-    check_writable(picture, folder=False)
+    check_output(picture, folder=False)
 
     from splatbot.atomic import atomic_write
     from splatbot.cli.progress import shares

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from splatbot.cli.outputs import check_writable
-from splatbot.cli.paths import check_state
+from splatbot.cli.paths import check_output, check_state
 from splatbot.errors import FormatError
 from splatbot.results.merge_output import check_merge
 
@@ -51,7 +50,7 @@ def merge(
     """
     check_runs(a, b)
     check_merge(a, b, out, overwrite=overwrite)
-    check_writable(out, folder=True)
+    check_output(out, folder=True)
 
     from splatbot.cli.map_page import page_of_map
     from splatbot.cli.progress import progress_display, shares

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import tempfile
 from pathlib import Path
 
 from splatbot.errors import FormatError, InputError
@@ -40,6 +41,9 @@ def system_error(error: OSError) -> str | None:
 def check_output(path: Path | None, flag: str = "--out", *, folder: bool = True) -> None:
     """Check that a file or a folder can be written at a path, without creating it.
 
+    A nameless file in the nearest folder that exists shows it. Permissions alone do not: root may write to each folder,
+    but /proc takes no files.
+
     Raises:
         InputError: the path names something else.
         OSError: the folder or its disk is not for writing.
@@ -61,6 +65,22 @@ def check_output(path: Path | None, flag: str = "--out", *, folder: bool = True)
     if not os.access(place, os.W_OK):
         code = errno.EROFS if os.statvfs(place).f_flag & os.ST_RDONLY else errno.EACCES
         raise OSError(code, os.strerror(code), str(path))
+    if place.is_dir():
+        try:
+            with tempfile.TemporaryFile(dir=place):
+                pass
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, str(path)) from error
+
+
+def check_new(path: Path, *, overwrite: bool) -> None:
+    """Check that a path is free, or that its content may be replaced.
+
+    Raises:
+        InputError: it exists, and ``overwrite`` is not set.
+    """
+    if path.exists() and not overwrite:
+        raise InputError("exists already.", file=path, field="--out", hint="name another one, or give --overwrite")
 
 
 def check_run(run: Path) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, TypeVar
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -16,8 +16,8 @@ from splatbot.collision.visibility import DepthView, measured_depths, passing_di
 from splatbot.geometry import nearest_rotation
 from splatbot.protocols import Array
 from splatbot.segmentation.clusters import clusters
+from splatbot.spacing import evenly_spaced
 
-T = TypeVar("T")
 Colors = Sequence[NDArray[np.uint8]]
 Kind = Literal["appeared", "removed", "moved"]
 
@@ -109,16 +109,11 @@ def find_changes(
     parts = ((views_a, colors_a, views_b), (views_b, colors_b, views_a))
     found: list[list[ChangedObject]] = []
     for kind, (views, colors, others) in zip(("removed", "appeared"), parts, strict=True):
-        points, shades = _seen_through(_some(views), _some(colors), _some(others), floor, quad)
+        views, others = (evenly_spaced(some, CONSTANTS.views) for some in (views, others))
+        points, shades = _seen_through(views, evenly_spaced(colors, CONSTANTS.views), others, floor, quad)
         found.append(_objects(kind, points, shades))  # type: ignore[arg-type]
         report(0.5 * len(found))
     return sorted(_with_moved(*found), key=lambda change: -float(np.prod(change.size)))
-
-
-def _some(values: Sequence[T]) -> list[T]:
-    """Return at most ``CONSTANTS.views`` evenly spaced ones."""
-    count = min(CONSTANTS.views, len(values))
-    return [values[k] for k in np.linspace(0, len(values) - 1, count).round().astype(int)]
 
 
 def _seen_through(

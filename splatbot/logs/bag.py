@@ -87,9 +87,9 @@ class BagLog(StampedLog):
         joint_delay: time [s] by which the stamps of joint positions are later than their motion.
 
     Raises:
-        LogError: the file is missing or damaged, a topic is missing or ambiguous, or nothing can be paired.
+        LogError: the file is missing or damaged, a topic is missing or ambiguous, or nothing can be paired. Depth is of
+            another camera, whose intrinsics or place are not recorded.
         CameraError: there are no usable intrinsics.
-        InputError: depth is of another camera, whose intrinsics or place are not recorded.
     """
 
     def __init__(
@@ -188,7 +188,7 @@ class BagLog(StampedLog):
         """Return the cameras of colour and depth by the headers of their first messages.
 
         Raises:
-            InputError: depth is of another camera, whose intrinsics or place are not recorded.
+            LogError: depth is of another camera, whose intrinsics or place are not recorded.
         """
         (color, depth), hint = self._pairs[0], f"state it, if depth is registered: {self.path.name}?registered=1"
         colors, depths = self._read(self._color, color), self._read(self._depth, depth)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from itertools import accumulate, pairwise
 from pathlib import Path
@@ -14,8 +14,9 @@ import yaml
 from splatbot.camera import Camera
 from splatbot.errors import LogError
 from splatbot.frame import Frame
-from splatbot.logs.base import Log, StampedLog
+from splatbot.logs.base import StampedLog
 from splatbot.logs.calibration import Calibration
+from splatbot.logs.listed import Opener, check_time_offset, local_address, stamps_of, truth_of
 from splatbot.trajectory import Trajectory
 
 MAX_RECORDINGS = 64
@@ -23,9 +24,6 @@ MAX_RECORDINGS = 64
 
 _KEYS = {"log", "camera", "time_offset"}
 _HINT = "write `recordings: [{log: FOLDER}, {log: FOLDER, time_offset: 60.0}]`"
-
-Opener = Callable[[str, str | None], Log]
-"""Opens a recording: its address, and the file with its intrinsics or None."""
 
 
 class ConsecutiveLog(StampedLog):
@@ -48,9 +46,8 @@ class ConsecutiveLog(StampedLog):
         self.uri, self.name = str(path), Path(path).stem
         self._file = Path(path)
         entries = _entries(self._file)
-        self._logs = [
-            opener(self._local(e["log"]), self._local(e["camera"]) if "camera" in e else None) for e in entries
-        ]
+        cameras = [local_address(self._file, e["camera"]) if "camera" in e else None for e in entries]
+        self._logs = [opener(local_address(self._file, e["log"]), c) for e, c in zip(entries, cameras, strict=True)]
         self._offsets = [float(entry.get("time_offset", 0.0)) for entry in entries]
         stamps = [[t + dt for t in stamps_of(log)] for log, dt in zip(self._logs, self._offsets, strict=True)]
         for number, (earlier, later) in enumerate(pairwise(stamps), 1):
@@ -68,8 +65,7 @@ class ConsecutiveLog(StampedLog):
     @property
     def ground_truth(self) -> Trajectory | None:
         """Reference poses of the first recording, see :class:`splatbot.logs.Log`."""
-        truth, offset = self._logs[0].ground_truth, self._offsets[0]
-        return truth if truth is None or not offset else replace(truth, stamps=truth.stamps + offset)
+        return truth_of(self._logs[0], self._offsets[0])
 
     @property
     def effects(self) -> list[dict[str, Any]]:
@@ -91,19 +87,8 @@ class ConsecutiveLog(StampedLog):
         frame = self._logs[number].read(index - self._begins[number])
         return replace(frame, index=index, stamp=frame.stamp + self._offsets[number])
 
-    def _local(self, address: str) -> str:
-        """Return an address, or the path of a file or folder relative to that of the list."""
-        local = self._file.parent / address
-        return str(local) if Path(str(local).partition("?")[0]).exists() else address
-
     def _wrong(self, field: str, message: str, hint: str) -> LogError:
         return LogError(message, file=self._file, field=field, hint=hint)
-
-
-def stamps_of(log: Log) -> list[float]:
-    """Return the stamps of the frames [s]; a recording that does not know them is decoded."""
-    known: list[float] | None = getattr(log, "stamps", None)
-    return [frame.stamp for frame in log] if known is None else known
 
 
 def _entries(file: Path) -> list[dict[str, Any]]:
@@ -121,9 +106,7 @@ def _entries(file: Path) -> list[dict[str, Any]]:
         where = f"recordings[{number}]"
         if not isinstance(entry, dict) or not isinstance(entry.get("log"), str) or not entry.keys() <= _KEYS:
             raise LogError(f"needs log, and may have {', '.join(sorted(_KEYS))}.", file=file, field=where, hint=_HINT)
-        offset = entry.get("time_offset", 0.0)
-        if isinstance(offset, bool) or not isinstance(offset, int | float):
-            raise LogError(f"is {offset!r:.40}.", file=file, field=f"{where}.time_offset", hint="give seconds")
+        check_time_offset(file, where, entry.get("time_offset", 0.0))
         if not isinstance(entry.get("camera", ""), str):
             raise LogError("is no text.", file=file, field=f"{where}.camera", hint="give a path")
     return entries

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from splatbot.frame import Frame
 from splatbot.layouts import is_camera, log_kind
 from splatbot.logs.base import Log, StampedLog
 from splatbot.logs.calibration import Calibration
+from splatbot.logs.listed import Opener, check_time_offset, local_address, stamps_of, truth_of
 from splatbot.trajectory import Trajectory
 
 MAX_CAMERAS = 8
@@ -23,11 +24,7 @@ MAX_CAMERAS = 8
 
 _NAME = re.compile(r"[A-Za-z0-9_-]{1,32}")
 _FIRST_KEYS = {"log", "camera", "time_offset"}
-_MAX_OFFSET_S = 1e6
 _HINT = "write `cameras: {wrist: {log: FOLDER}, table: {log: FOLDER, T_world_camera: {...}}}`"
-
-Opener = Callable[[str, str | None], Log]
-"""Opens the recording of a camera: its address, and the file with its intrinsics or None."""
 
 
 @dataclass(frozen=True)
@@ -47,9 +44,7 @@ class RigCamera:
     @property
     def stamps(self) -> list[float]:
         """Stamps of the frames [s]; a recording that does not know them is decoded."""
-        known: list[float] | None = getattr(self.log, "stamps", None)
-        known = [frame.stamp for frame in self.log] if known is None else known
-        return [stamp + self.time_offset for stamp in known]
+        return [stamp + self.time_offset for stamp in stamps_of(self.log)]
 
 
 class RigLog(StampedLog):
@@ -92,8 +87,7 @@ class RigLog(StampedLog):
     @property
     def ground_truth(self) -> Trajectory | None:
         """Reference poses of the first camera, see :class:`splatbot.logs.Log`."""
-        truth, offset = self.parts[0].log.ground_truth, self.parts[0].time_offset
-        return truth if truth is None or not offset else replace(truth, stamps=truth.stamps + offset)
+        return truth_of(self.parts[0].log, self.parts[0].time_offset)
 
     @property
     def effects(self) -> list[dict[str, Any]]:
@@ -118,20 +112,14 @@ class RigLog(StampedLog):
         return replace(frame, index=index, stamp=frame.stamp + part.time_offset, camera_name=name)
 
     def _part(self, name: str, values: Mapping[str, Any], opener: Opener) -> RigCamera:
-        camera, address = values.get("camera"), self._beside(values["log"])
+        camera, address = values.get("camera"), local_address(self._file, values["log"])
         if is_camera(address):
             hint = "name recordings only, or cameras only"
             raise self._wrong(f"cameras.{name}.log", "is a camera, but others are recordings.", hint)
         if log_kind(address) == "rig":
             raise self._wrong(f"cameras.{name}.log", "is a rig itself.", "name the recordings of its cameras")
-        opened = opener(address, self._beside(camera) if camera else None)
+        opened = opener(address, local_address(self._file, camera) if camera else None)
         return RigCamera(name, opened, float(values.get("time_offset", 0.0)))
-
-    def _beside(self, address: str) -> str:
-        """Return an address, or the path of a file or folder relative to that of the rig."""
-        local = self._file.parent / address
-        path, mark, options = str(local).partition("?")
-        return path + mark + options if Path(path).exists() or local.exists() else address
 
     def _check_overlap(self) -> None:
         """Refuse a camera that has no frame during the recording of the first one."""
@@ -191,9 +179,7 @@ def rig_entries(file: Path) -> dict[str, dict[str, Any]]:
 
 
 def _check_entry(file: Path, where: str, values: Mapping[str, Any]) -> None:
-    offset = values.get("time_offset", 0.0)
-    if isinstance(offset, bool) or not isinstance(offset, int | float) or not abs(offset) <= _MAX_OFFSET_S:
-        raise LogError(f"is {offset!r:.40}.", file=file, field=f"{where}.time_offset", hint="give seconds")
+    check_time_offset(file, where, values.get("time_offset", 0.0))
     for key in ("log", "camera"):
         if not isinstance(values.get(key, ""), str):
             raise LogError("is no text.", file=file, field=f"{where}.{key}", hint="give a path")

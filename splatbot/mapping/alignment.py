@@ -15,6 +15,7 @@ from splatbot.frame import Frame
 from splatbot.geometry import adjoint, inverse, se3_log
 from splatbot.mapping.extrinsics import MeasuredPose, fused, locate_in_map
 from splatbot.mapping.keyframes import Keyframe
+from splatbot.spacing import evenly_spaced
 from splatbot.tracking.features import match_pose
 from splatbot.tracking.nearby_keyframes import is_within, pose_distance
 from splatbot.tracking.place_recognition import likeliest
@@ -101,7 +102,7 @@ def align_maps(
         InputError: B has too few keyframes, the maps show no common place, or the located keyframes contradict each
             other.
     """
-    chosen = _spread([k for k in keyframes_b if len(k.features)], CONSTANTS.keyframes)
+    chosen = evenly_spaced([k for k in keyframes_b if len(k.features)], CONSTANTS.keyframes)
     if not chosen or not any(len(k.features) for k in keyframes_a):
         raise InputError("a map has no keyframes with features.", field="keyframes", hint="map its log again")
     if len(chosen) < CONSTANTS.least_agreeing:
@@ -126,12 +127,6 @@ def align_maps(
     T, covariance = fused([_world_of(found, poses[n]) for n, found in agreeing.items()])
     deviation = covariance / len(agreeing) * _birge(T, agreeing, poses)
     return MapAlignment(T, deviation, agreeing, len(chosen), len(second))
-
-
-def _spread(keyframes: Sequence[Keyframe], most: int) -> list[Keyframe]:
-    """Return at most ``most`` evenly spaced keyframes."""
-    count = min(most, len(keyframes))
-    return [keyframes[k] for k in np.linspace(0, len(keyframes) - 1, count).round().astype(int)]
 
 
 def _frame_of(keyframe: Keyframe) -> Frame:

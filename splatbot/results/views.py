@@ -13,6 +13,7 @@ from splatbot.errors import FormatError
 from splatbot.logs import Log
 from splatbot.protocols import Array
 from splatbot.results.folder import RunFolder
+from splatbot.spacing import evenly_spaced
 from splatbot.tracking.prepare import usable_depth
 from splatbot.tracking.rectify import RectifiedLog
 
@@ -64,7 +65,8 @@ def subsampled_views(run: RunFolder, log: Log) -> tuple[DepthView, ...]:
         LogError: the log is damaged.
     """
     poses = run.load_poses()
-    return tuple(subsampled(view) for view in _views(run, log, poses, _spread(sorted(poses))))
+    indices = evenly_spaced(sorted(poses), CONSTANTS.max_frames_in_memory)
+    return tuple(subsampled(view) for view in _views(run, log, poses, indices))
 
 
 def raw_views(
@@ -89,7 +91,7 @@ def raw_views(
         LogError: the log is damaged.
     """
     poses = run.load_poses()
-    indices, rectified = _spread(sorted(poses), most), rectified_log(run, log)
+    indices, rectified = evenly_spaced(sorted(poses), most), rectified_log(run, log)
     views = []
     for index in indices:
         frame = rectified[index]
@@ -111,12 +113,6 @@ def subsampled(view: DepthView) -> DepthView:
     # Pixel (n i, n j) becomes (i, j); its ray does not change.
     small = Camera(camera.fx / step, camera.fy / step, camera.cx / step, camera.cy / step, width, height)
     return kept, small, T
-
-
-def _spread(indices: Sequence[int], most: int = CONSTANTS.max_frames_in_memory) -> list[int]:
-    """Return at most ``most`` evenly spaced ones of ``indices``."""
-    count = min(most, len(indices))
-    return [indices[k] for k in np.linspace(0, len(indices) - 1, count).round().astype(int)]
 
 
 def _views(run: RunFolder, log: Log, poses: Mapping[int, Array], indices: Sequence[int]) -> Iterator[DepthView]:

@@ -17,7 +17,7 @@ from splatbot.atomic import write_text
 from splatbot.errors import InputError
 from splatbot.geometry import adjoint, inverse, rotation_to_quat
 from splatbot.logs import open_log
-from splatbot.logs.consecutive import stamps_of
+from splatbot.logs.listed import stamps_of
 from splatbot.mapping.alignment import MapAlignment, align_maps
 from splatbot.mapping.depth_fusion import DepthNoiseModel
 from splatbot.mapping.joining import JoinedModel, join_models, without_contradicted

@@ -14,8 +14,9 @@ from splatbot.camera import Camera
 from splatbot.evaluation.image import psnr, ssim
 from splatbot.gaussians import GaussianModel
 from splatbot.rasterize.views import render_rgbd
+from splatbot.spacing import evenly_spaced
 from splatbot.training.images import ImageCache
-from splatbot.training.map_views import MapViews, around, spread
+from splatbot.training.map_views import MapViews, around
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -93,7 +94,7 @@ def compare_recorded(
     """
     shade = views.options.shade
     own = {view.name: view.T_world_camera for view in views_of_b.data.views} if views_of_b is not None else {}
-    for view in spread(views.held_out or views.mapped, count):
+    for view in evenly_spaced(views.held_out or views.mapped, count):
         photo = ImageCache([view]).photo(0)
         recorded = (255.0 * photo.over(shade)).round().numpy().astype(np.uint8)
         counted = None if photo.trained is None else photo.trained.numpy()

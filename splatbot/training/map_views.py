@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,12 +11,11 @@ from numpy.typing import NDArray
 from splatbot.camera import Camera
 from splatbot.gaussians import GaussianModel
 from splatbot.rasterize.views import default_view
+from splatbot.spacing import evenly_spaced
 from splatbot.training.datasets import TrainingData, TrainingView
 from splatbot.training.images import ImageCache
 from splatbot.training.options import TrainingOptions
 from splatbot.training.scoring import score_held_out, summary
-
-T = TypeVar("T")
 
 _VISIBLE_SHARE = 0.9  # of the Gaussians; the rest are mostly floaters
 _LEAST_RADIUS = 0.05  # [m]
@@ -44,14 +42,8 @@ class MapViews:
 
     def score(self, model: GaussianModel, most: int) -> dict[str, Any]:
         """Score a map on at most ``most`` held-out views, see :func:`splatbot.training.scoring.summary`."""
-        images = ImageCache(spread(self.held_out, most))
+        images = ImageCache(evenly_spaced(self.held_out, most))
         return summary(score_held_out(model, images, self.options, self.data.scene_extent))
-
-
-def spread(items: Sequence[T], most: int) -> list[T]:
-    """Return at most ``most`` evenly spaced items."""
-    count = min(most, len(items))
-    return [items[k] for k in np.linspace(0, len(items) - 1, count).round().astype(int)]
 
 
 def around(

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
 from splatbot.rasterize.views import render_view
-from splatbot.training.map_views import MapViews, around, spread
+from splatbot.training.map_views import MapViews, around
 from splatbot.training.options import TrainingOptions
 from tests.unit.training.rendered import rendered_data, true_model
 
@@ -21,11 +20,6 @@ def test_virtual_views_see_the_map_from_all_sides() -> None:
         assert alpha.max() > 0.9
         assert alpha[20:28, 28:36].mean() > 2 * alpha[:, 0].mean()  # the map is in the middle
         assert T[1, 1] > 0  # y of the image is down, as that of the world
-
-
-@pytest.mark.parametrize(("count", "most", "expected"), [(5, 10, [0, 1, 2, 3, 4]), (5, 3, [0, 2, 4]), (0, 3, [])])
-def test_spread_items_are_evenly_spaced(count: int, most: int, expected: list[int]) -> None:
-    assert spread(range(count), most) == expected
 
 
 def test_a_map_scores_well_against_photographs_of_itself() -> None:
