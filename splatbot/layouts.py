@@ -32,6 +32,7 @@ COLMAP_DEPTH = ("depth", "depths")
 """Folders of the depth images of a COLMAP scene, the preferred one first."""
 
 MAP_NAME = "map.ply"
+TILES_NAME = "tiles.json"
 RECORDING = "recording.mcap"
 TRAINING_NAME = "training.json"
 MAP_SUFFIXES = (".ply", ".splat", ".spz", ".sbz", ".sog", ".glb")
@@ -195,6 +196,11 @@ def is_map(path: str | Path) -> bool:
     return place.is_file() and (place.suffix.lower() in MAP_SUFFIXES or place.suffix.lower() in _FOREIGN_MAPS)
 
 
+def is_tiled_map(path: str | Path) -> bool:
+    """Return whether a path names the folder of a tiled map."""
+    return (Path(path) / TILES_NAME).is_file()
+
+
 def _is_sog(folder: Path) -> bool:
     return (folder / _SOG_NAME).is_file() and any(folder.glob("*.webp"))
 
@@ -235,6 +241,8 @@ def log_layout(path: Path) -> bool:
 
 
 def _map_hint(folder: Path) -> str:
+    if is_tiled_map(folder):
+        return "it is a tiled map, for render, info and serve; give the map that it was made of"
     if log_layout(folder):
         return f"it is a recording; map it first: splatbot map {folder}"
     if (folder / "state").is_dir():
