@@ -36,6 +36,12 @@ class IdempotencyError(InputError):
     http_status = 409
 
 
+class TooManyJobsError(InputError):
+    """As many jobs of one client wait or run as may."""
+
+    http_status = 429
+
+
 class JobCancelled(Exception):  # noqa: N818 (no error: somebody wanted it)
     """Ends the work of a job that is no longer wanted."""
 
@@ -52,6 +58,7 @@ class Job:
         detail: present activity, or the reason of a failure.
         result: result of the job.
         created, started, ended: Unix time [s].
+        client: that the job is for; empty if it counts in no quota.
     """
 
     id: str
@@ -63,6 +70,7 @@ class Job:
     created: float = field(default_factory=time.time)
     started: float | None = None
     ended: float | None = None
+    client: str = ""
 
 
 class JobHandle:
@@ -102,11 +110,12 @@ class Jobs:
         bus: receives each change.
         workers: jobs that run at once.
         capacity: jobs that may wait.
+        client_capacity: jobs of one client that may wait or run. If None, any number.
     """
 
-    def __init__(self, bus: Bus, *, workers: int = 1, capacity: int = 16) -> None:
+    def __init__(self, bus: Bus, *, workers: int = 1, capacity: int = 16, client_capacity: int | None = None) -> None:
         self._bus = bus
-        self._capacity = capacity
+        self._capacity, self._client_capacity = capacity, client_capacity
         self._lock = threading.RLock()
         self._changed = threading.Condition(self._lock)
         self._jobs: dict[str, Job] = {}
@@ -127,6 +136,7 @@ class Jobs:
         key: str | None = None,
         request: str = "",
         abandoned: Callable[[], None] | None = None,
+        client: str = "",
     ) -> tuple[Job, bool]:
         """Queue work; the job and whether it is new.
 
@@ -136,9 +146,11 @@ class Jobs:
             key: of the request (Idempotency-Key): a repeated request with it returns the same job.
             request: content of the request; another request with the same key is refused.
             abandoned: called instead of ``work`` when the job is cancelled before it begins.
+            client: that the job is for.
 
         Raises:
             BusyError: as many jobs wait as may, or the service is about to stop.
+            TooManyJobsError: as many jobs of the client wait or run as may.
             IdempotencyError: the key belongs to another request.
         """
         with self._lock:
@@ -149,7 +161,11 @@ class Jobs:
             if self._closed or waiting >= self._capacity:
                 why = "the service is stopping" if self._closed else f"{waiting} jobs wait"
                 raise BusyError(f"{why}.", hint="try again later")
-            job = Job(uuid4().hex[:16], kind)
+            own = self._count(client)
+            if client and self._client_capacity is not None and own >= self._client_capacity:
+                hint = "wait for one of them, cancel one, or raise SPLATBOT_MAX_CLIENT_JOBS"
+                raise TooManyJobsError(f"{own} jobs of this client wait or run.", hint=hint)
+            job = Job(uuid4().hex[:16], kind, client=client)
             handle = JobHandle(self, job.id)
             self._jobs[job.id], self._handles[job.id] = job, handle
             if key is not None:
@@ -188,6 +204,11 @@ class Jobs:
         """List all jobs, oldest first."""
         with self._lock:
             return tuple(self._jobs.values())
+
+    def count(self, client: str) -> int:
+        """Return the number of jobs of a client that wait or run."""
+        with self._lock:
+            return self._count(client)
 
     def cancel(self, job_id: str) -> Job:
         """Request the end of a job. A waiting job ends now, a running one at its next progress report.
@@ -276,6 +297,9 @@ class Jobs:
 
     def _publish(self, job: Job) -> None:
         self._bus.publish(job_topic(job.id), job)
+
+    def _count(self, client: str) -> int:
+        return sum(job.client == client and job.state not in ENDED for job in self._jobs.values())
 
     def _known(self, key: str | None, request: str) -> Job | None:
         if key is None or key not in self._keys:

@@ -121,8 +121,7 @@ class MapLibrary:
                 for earlier in _states(home):  # of another life of the name, which could not be read
                     _set_aside(earlier)
             draft.mkdir()
-            self._write(served, served.snapshot, draft)
-            write_sums(draft, [path.name for path in draft.iterdir()])
+            write_map(served, served.snapshot, draft)
             if state.exists():  # an earlier save of this version ended before it was named
                 shutil.rmtree(state)
             replace(draft, state)
@@ -216,16 +215,6 @@ class MapLibrary:
         if not same:
             raise OSError(errno.ESTALE, "the folder was unmounted or replaced")
 
-    def _write(self, served: ServedMap, snapshot: Snapshot, folder: Path) -> None:
-        save_ply(snapshot.model, folder / "map.ply", bookkeeping=True)
-        if served.trajectory is not None and len(served.trajectory.stamps):
-            served.trajectory.save(folder / "trajectory.tum")
-        if served.workspace is not None:
-            served.workspace.save(folder / WORKSPACE)
-        saved = {"format": 2, "source": served.source, "map_version": snapshot.map_version, "stamp": snapshot.stamp}
-        with atomic_write(folder / "map.json") as file:
-            file.write(json.dumps(saved).encode())
-
 
 def _states(home: Path) -> list[Path]:
     """Return the folders of a map's states, newest first."""
@@ -241,8 +230,40 @@ def _current(home: Path) -> str | None:
         return None
 
 
+def write_map(served: ServedMap, snapshot: Snapshot, folder: Path) -> None:
+    """Write a state of a map into an empty folder, with checksums of its files."""
+    save_ply(snapshot.model, folder / "map.ply", bookkeeping=True)
+    if served.trajectory is not None and len(served.trajectory.stamps):
+        served.trajectory.save(folder / "trajectory.tum")
+    if served.workspace is not None:
+        served.workspace.save(folder / WORKSPACE)
+    saved = {
+        "format": 2,
+        "source": served.source,
+        "map_version": snapshot.map_version,
+        "stamp": snapshot.stamp,
+        "world": served.world,
+        "owner": served.owner,
+    }
+    with atomic_write(folder / "map.json") as file:
+        file.write(json.dumps(saved).encode())
+    write_sums(folder, [path.name for path in folder.iterdir()])
+
+
 def _read(folder: Path) -> dict[str, Any]:
     """Read a state as arguments of :meth:`MapStore.add`.
+
+    Raises:
+        InputError: a file is damaged, or belongs to another folder.
+    """
+    found = read_map(folder)
+    if folder.name != f"v{found['snapshot'].map_version}":
+        raise FormatError("belongs to another folder.", file=folder / "map.json", hint=_HINT)
+    return found
+
+
+def read_map(folder: Path) -> dict[str, Any]:
+    """Read a folder of :func:`write_map` as arguments of :meth:`MapStore.add`.
 
     Raises:
         InputError: a file is damaged.
@@ -252,12 +273,12 @@ def _read(folder: Path) -> dict[str, Any]:
     try:
         saved = json.loads(path.read_text())
         source, version, stamp = str(saved["source"]), int(saved["map_version"]), float(saved["stamp"])
+        more = {name: str(saved[name]) for name in ("world", "owner") if name in saved}
         whole = listed or saved.get("format", 1) == 1
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise FormatError(f"is damaged ({error}).", file=path, hint=_HINT) from error
-    if not whole or folder.name != f"v{version}":
-        why = "belongs to another folder." if whole else f"is saved with checksums, and there is no {SUMS}."
-        raise FormatError(why, file=path, hint=_HINT)
+    if not whole:
+        raise FormatError(f"is saved with checksums, and there is no {SUMS}.", file=path, hint=_HINT)
     if not listed:
         _log.warning("%s has no checksums: an earlier version saved it", folder)
     trajectory = folder / "trajectory.tum"
@@ -266,6 +287,7 @@ def _read(folder: Path) -> dict[str, Any]:
         "snapshot": Snapshot(load_ply(folder / "map.ply"), version, stamp),
         "trajectory": Trajectory.load(trajectory) if trajectory.is_file() else None,
         "workspace": find_workspace(folder),
+        **more,
     }
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from typing import Protocol
 
 from splatbot.errors import MapNotFoundError, SplatbotError
@@ -16,6 +16,7 @@ from splatbot.protocols import FrameSource
 from splatbot.services.store import MapStore, ServedMap, State
 from splatbot.services.threads import join_started
 from splatbot.services.topics import FRAME, RESULT, of_camera
+from splatbot.services.turns import Turns
 from splatbot.slam import FrameResult
 from splatbot.trajectory import Trajectory
 
@@ -68,10 +69,11 @@ class LiveMapping:
         store: store of the map.
         served: map that receives the frames; once it is deleted, mapping ends.
         source: frames in their order: a log, a camera, or the frames that clients push.
-        mapper: only the mapping thread touches it once started.
+        mapper: only the mapping thread touches it once started, or a thread for which mapping is :meth:`paused`.
         on_result: called in the mapping thread after each frame.
         on_error: called in the mapping thread with the index of a frame that cannot be mapped; mapping goes on. If
             None, such a frame ends it.
+        on_mapped: called in the mapping thread with the mapper once all frames are mapped, or :meth:`stop` was called.
         on_end: called in the mapping thread at its end.
     """
 
@@ -84,15 +86,19 @@ class LiveMapping:
         *,
         on_result: Callable[[FrameResult], None] | None = None,
         on_error: Callable[[int, SplatbotError], None] | None = None,
+        on_mapped: Callable[[LiveMapper], None] = lambda _mapper: None,
         on_end: Callable[[], None] = lambda: None,
     ) -> None:
         self._store = store
         self._served = served
         self._source = source
-        self._mapper = mapper
+        self.mapper = mapper
         self._on_result = on_result
         self._on_error = on_error
+        self._on_mapped = on_mapped
         self._on_end = on_end
+        self._turns = Turns()
+        self._ended = False
         served.cameras.update(mapper.further_cameras)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self.run, name=f"mapping-{served.id}", daemon=True)
@@ -113,6 +119,25 @@ class LiveMapping:
         self._thread.join(timeout_s)
         return not self._thread.is_alive()
 
+    @contextmanager
+    def paused(self, timeout_s: float) -> Iterator[bool]:
+        """Enter between two frames, with the state of :attr:`mapper` published; False once mapping has ended.
+
+        Raises:
+            BusyError: a frame is mapped for longer than ``timeout_s`` [s].
+            MapNotFoundError: the map was deleted.
+        """
+        with self._turns.between_frames(timeout_s):
+            if not self._ended and (snapshot := self.mapper.snapshot()).map_version:
+                self._publish(snapshot)
+            yield not self._ended
+
+    def go_on_with(self, mapper: LiveMapper) -> None:
+        """Map the next frames with another mapper; call it while :meth:`paused`."""
+        self.mapper.close()
+        self.mapper = mapper
+        self._served.cameras.update(mapper.further_cameras)
+
     def run(self) -> None:
         """Map until the frames end, :meth:`stop`, or an error, which becomes the map's state."""
         try:
@@ -128,7 +153,9 @@ class LiveMapping:
         else:
             self._end("ended")
         finally:
-            self._mapper.close()
+            with self._turns.frame():
+                self._ended = True
+                self.mapper.close()
             self._on_end()
 
     def _feed(self) -> None:
@@ -136,28 +163,37 @@ class LiveMapping:
         for frame in self._source:
             if self._stop.is_set():
                 break
-            self._store.tell(self._served, of_camera(frame.camera_name, FRAME), frame)
-            result = self._process(frame)
-            if result is None:
-                continue
-            self._served.cameras.update(self._mapper.further_cameras, result)
-            self._store.tell(self._served, of_camera(result.camera_name, RESULT), result)
-            if result.keyframe:
-                self._publish()
+            with self._turns.frame():
+                result = self._map(frame)
+            if result is not None and result.keyframe:
                 shown = result.index
-            if self._on_result is not None:
-                self._on_result(result)
-        if not self._stop.is_set():
-            self._mapper.finish()
+        with self._turns.frame():
+            if not self._stop.is_set():
+                self.mapper.finish()
+                self._publish()
+            elif shown >= 0:
+                self._publish()  # without the final refinement: a stop request wants a quick end
+            self._on_mapped(self.mapper)
+
+    def _map(self, frame: Frame) -> FrameResult | None:
+        """Map a frame, and publish its result; return None if it cannot be mapped."""
+        self._store.tell(self._served, of_camera(frame.camera_name, FRAME), frame)
+        result = self._process(frame)
+        if result is None:
+            return None
+        self._served.cameras.update(self.mapper.further_cameras, result)
+        self._store.tell(self._served, of_camera(result.camera_name, RESULT), result)
+        if result.keyframe:
             self._publish()
-        elif shown >= 0:
-            self._publish()  # without the final refinement: a stop request wants a quick end
+        if self._on_result is not None:
+            self._on_result(result)
+        return result
 
     def _process(self, frame: Frame) -> FrameResult | None:
         """Map a frame; if it fails, call ``on_error`` and return None."""
         try:
             with self._store.frames_first.mapping():
-                return self._mapper.process(frame)
+                return self.mapper.process(frame)
         except Exception as error:
             if self._on_error is None:
                 raise
@@ -168,9 +204,10 @@ class LiveMapping:
             self._on_error(frame.index, error)
             return None
 
-    def _publish(self) -> None:
-        served, mapper = self._served, self._mapper
-        self._store.publish(served.id, mapper.snapshot(), mapper.trajectory, generation=served.generation)
+    def _publish(self, snapshot: Snapshot | None = None) -> None:
+        served, mapper = self._served, self.mapper
+        present = snapshot or mapper.snapshot()
+        self._store.publish(served.id, present, mapper.trajectory, generation=served.generation)
 
     def _end(self, state: State, detail: str | None = None) -> None:
         with suppress(MapNotFoundError):  # deleted meanwhile

@@ -13,7 +13,6 @@ from splatbot.logs import Log, open_log
 from splatbot.logs.rig import RigLog
 from splatbot.robots.in_view import has_tf
 from splatbot.services.jobs import JobCancelled, JobHandle, Work
-from splatbot.services.live import LiveMapping
 from splatbot.services.problems import disk_error
 from splatbot.services.recordings import allowed_log, unpack
 from splatbot.services.robot_mask import MaskedSource
@@ -141,7 +140,7 @@ def _map(
         else:
             handle.report((result.index + 1) / total, f"frame {result.index + 1} of {total}")
 
-    mapping = LiveMapping(runtime.store, served, frames, Slam(config), on_result=on_result)
+    mapping = runtime.mapping(served, frames, Slam(config), on_result=on_result)
     mapping.run()
     try:
         made = runtime.store.get(served.id, generation=served.generation)

@@ -119,7 +119,7 @@ def _on_splatbot_error(request: Request, error: Exception) -> ProblemResponse:
         error.http_status,
         f"{error.field}: {error.message}" if error.field else error.message,
         kind=kind,
-        headers={"Retry-After": "1"} if error.http_status == 503 else None,
+        headers={"Retry-After": "1"} if error.http_status in (429, 503) else None,
         map_version=_version(request),
         code=error.code,
         file=file,

@@ -6,9 +6,10 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from functools import partial
 from typing import Any
 
 from splatbot.config import Config
@@ -19,12 +20,14 @@ from splatbot.protocols import Array, FrameSource
 from splatbot.rasterize.native import native
 from splatbot.robots.robot import RobotModel
 from splatbot.services.arms import Arms, known_robot
+from splatbot.services.history import MapHistory
 from splatbot.services.jobs import Job, Jobs, Work
 from splatbot.services.library import MapLibrary
 from splatbot.services.live import LiveMapper, LiveMapping
 from splatbot.services.metrics import Metrics
 from splatbot.services.plans import Plans
 from splatbot.services.pushed import PushedFrames, StreamEndedError
+from splatbot.services.quotas import Quotas
 from splatbot.services.robot_mask import MaskedSource, RobotMask
 from splatbot.services.ros.robot_topics import RobotTopics
 from splatbot.services.scratch import sweep_scratch
@@ -33,6 +36,9 @@ from splatbot.services.steady_camera import SteadyCamera
 from splatbot.services.store import MapExistsError, MapStore, ServedMap
 from splatbot.services.threads import join_started
 from splatbot.services.topics import JOINTS, ROS_ROBOT, JointState, robot_topic
+from splatbot.services.versions import FOLDER as VERSIONS
+from splatbot.services.versions import Versions
+from splatbot.slam import FrameResult
 from splatbot.workspace import Workspace
 
 ROS_MAP = "ros"
@@ -52,7 +58,7 @@ class Runtime:
 
     Raises:
         InputError: the robot of the settings is unknown.
-        FormatError: the scene of the settings is damaged.
+        FormatError: the scene of the settings, or the index of versions, is damaged.
 
     Attributes:
         store: maps and their bus.
@@ -61,6 +67,8 @@ class Runtime:
         plans: the latest ones.
         metrics: for Prometheus.
         library: maps on disk. If None, maps live in memory only.
+        quotas: of clients.
+        history: versions of maps.
         draining: the service is about to end.
         robot, workspace: the settings' robot and its scene, for frames of ROS topics.
     """
@@ -69,7 +77,7 @@ class Runtime:
         self, settings: ServiceSettings, store: MapStore | None = None, *, config: Config | None = None
     ) -> None:
         self.settings = settings
-        self.store = store or MapStore(most=settings.max_maps)
+        self.store = store or MapStore(most=settings.max_maps, most_of_owner=settings.max_client_maps)
         self.bus = self.store.bus
         self.config = config or Config()
         self.robot = None if settings.robot is None else known_robot(settings.robot)
@@ -79,7 +87,12 @@ class Runtime:
         self.library = MapLibrary(settings.data_dir) if settings.data_dir is not None else None
         if self.library is not None:
             self.library.lock()
-        self.jobs = Jobs(self.bus, workers=settings.job_workers, capacity=settings.max_jobs)
+        self.jobs = Jobs(
+            self.bus,
+            workers=settings.job_workers,
+            capacity=settings.max_jobs,
+            client_capacity=settings.max_client_jobs,
+        )
         self.arms = Arms(self.store)
         self.plans = Plans()
         self.metrics = Metrics(self.store, self.jobs, self.library)
@@ -93,6 +106,9 @@ class Runtime:
         self._started = False
         self._lock = threading.Lock()
         self._disk = threading.Lock()  # a map is either saved or deleted
+        versions = self._open_versions()
+        self.quotas = Quotas(settings, self.store, self.jobs, versions)
+        self.history = MapHistory(self.store, self.library, versions, self.quotas, self._disk, self._mappings.get)
         self._robot_news = self.bus.subscribe(ROS_ROBOT, capacity=_WAITING_NEWS, latched=False)
         self._robot_listener = threading.Thread(target=self._take_robot_news, name="robot", daemon=True)
         self._ended = threading.Event()
@@ -121,13 +137,58 @@ class Runtime:
                 source, self.settings.camera_wait_s, lambda problem: self._report_camera(served, problem)
             )
         frames = source if served.mask is None else MaskedSource(source, served.mask)
-        mapping = LiveMapping(self.store, served, frames, mapper)
+        mapping = self.mapping(served, frames, mapper)
         with self._lock:
-            self._mappings[served.generation] = mapping
             if not self._started:
                 self._waiting.append(mapping)  # a recording of the service holds its first frame too
                 return
         self._begin(mapping)
+
+    def mapping(
+        self,
+        served: ServedMap,
+        source: Iterable[Frame],
+        mapper: LiveMapper,
+        *,
+        on_result: Callable[[FrameResult], None] | None = None,
+        on_error: Callable[[int, SplatbotError], None] | None = None,
+        on_end: Callable[[], None] = lambda: None,
+    ) -> LiveMapping:
+        """Return the mapping of frames into a map, which the service knows until it ends.
+
+        Args:
+            served, source, mapper, on_result, on_error, on_end: as for :class:`LiveMapping`.
+        """
+
+        def ended() -> None:
+            with self._lock:
+                self._mappings.pop(served.generation, None)
+            on_end()
+
+        mapping = LiveMapping(
+            self.store,
+            served,
+            source,
+            mapper,
+            on_result=on_result,
+            on_error=on_error,
+            on_mapped=partial(self.history.save_end, served),
+            on_end=ended,
+        )
+        with self._lock:
+            self._mappings[served.generation] = mapping
+        return mapping
+
+    def _open_versions(self) -> Versions | None:
+        """Open the saved versions in the locked data folder, if there is one."""
+        if self.library is None:
+            return None
+        return Versions(
+            self.library.folder / VERSIONS,
+            most=self.settings.max_versions,
+            most_bytes=self.settings.max_versions_bytes,
+            served=self.store.find,
+        )
 
     def _report_camera(self, served: ServedMap, problem: str | None) -> None:
         with suppress(MapNotFoundError):  # deleted meanwhile
@@ -140,33 +201,41 @@ class Runtime:
         workspace: Workspace | None = None,
         mask: RobotMask | None = None,
         config: Config | None = None,
+        owner: str = "",
     ) -> ServedMap:
         """Create a map that receives its frames through :meth:`stream`; ``mask`` masks the robot in them.
 
         Args:
             config: of its mapping, with its further cameras. If None, that of the service.
+            owner: client whose quota it counts in; empty if the service makes it.
 
         Raises:
             MapExistsError: the name is taken.
+            TooManyMapsError, QuotaError: there are as many maps, of all clients or of this one, as may be.
         """
         from splatbot.slam import Slam
 
         config = config or self.config
         served = self.store.add(
-            map_id, source="pushed frames", state="mapping", workspace=workspace, mask=mask, awaited=False
+            map_id,
+            source="pushed frames",
+            state="mapping",
+            workspace=workspace,
+            mask=mask,
+            awaited=False,
+            owner=owner,
         )
         frames = PushedFrames(self.settings.max_waiting_frames, mask, config.cameras)
-        mapping = LiveMapping(
-            self.store,
+        mapping = self.mapping(
             served,
             frames,
             Slam(config),
             on_result=frames.answer,
             on_error=frames.refuse,
-            on_end=lambda: self._stream_ended(served.generation, frames),
+            on_end=lambda: frames.abandon("mapping has ended"),
         )
         with self._lock:
-            self._streams[served.generation], self._mappings[served.generation] = frames, mapping
+            self._streams[served.generation] = frames
         self._begin(mapping)
         return served
 
@@ -282,17 +351,18 @@ class Runtime:
             except Exception:  # one odd message must not end the others
                 _log.exception("%s from a client could not be used", topic)
 
-    def make(self, served: ServedMap, work: Work, **more: Any) -> Job:
+    def make(self, served: ServedMap, work: Work, *, kind: str = "map", **more: Any) -> Job:
         """Queue the job that makes a map; deleting the map cancels it.
 
         Args:
+            kind: of the job.
             more: arguments of :meth:`splatbot.services.jobs.Jobs.submit`.
 
         Raises:
-            BusyError: as many jobs wait as may.
+            BusyError, TooManyJobsError: as many jobs wait, or as many of the client, as may.
             IdempotencyError: the key belongs to another request.
         """
-        job, _ = self.jobs.submit("map", work, **more)
+        job, _ = self.jobs.submit(kind, work, client=served.owner, **more)
         with self._lock:
             self._jobs_of[served.generation] = job.id
         return job
@@ -307,6 +377,7 @@ class Runtime:
         with self._disk:
             self.store.get(served.id, generation=served.generation)
             if self.library is not None:
+                self.history.versions.remove_map(served.id)
                 self.library.remove(served.id)
             self.store.remove(served.id, generation=served.generation)
         with self._lock:
@@ -354,12 +425,6 @@ class Runtime:
     def _time_left(self) -> float:
         """Return the time [s] that one part may take to end: the rest of ``shutdown_s``, at least 0.5 s."""
         return max(0.5, self._deadline - time.monotonic())
-
-    def _stream_ended(self, generation: int, frames: PushedFrames) -> None:
-        """Fail the requests that still wait, and free the mapper."""
-        frames.abandon("mapping has ended")
-        with self._lock:
-            self._mappings.pop(generation, None)
 
     def _begin(self, mapping: LiveMapping) -> None:
         self._starter.submit(mapping.start).result()

@@ -56,6 +56,18 @@ class ServiceSettings(BaseSettings):
     arm: str | None = Field(None, description="an arm on the network, e.g. ur:192.168.1.10; its model is `robot`")
     camera_wait_s: float = Field(60.0, ge=0, description="how long a camera that is gone is opened again [s]")
     max_maps: int = Field(256, ge=1, description="maps that are served at once")
+    max_client_maps: int = Field(128, ge=1, description="maps that one client makes; more are answered 403")
+    max_client_bytes: int = Field(
+        16 * 2**30,
+        ge=1024,
+        description="Gaussians of its maps, and its versions on disk; more are answered 403 [bytes]",
+    )
+    max_versions: int = Field(32, ge=2, description="saved versions of one map; the oldest without a label make room")
+    max_versions_bytes: int = Field(
+        20 * 2**30, ge=1024, description="size of all versions in data_dir; the client's oldest make room [bytes]"
+    )
+    max_merge_gaussians: int = Field(2_000_000, ge=1, description="of both maps of one merge or comparison")
+    max_merge_keyframes: int = Field(1000, ge=2, description="of both maps of one merge or comparison")
     max_points: int = Field(100_000, ge=1, description="points in one distance request")
     max_configurations: int = Field(10_000, ge=1, description="joint configurations in one request")
     max_views: int = Field(16, ge=1, description="views in one render request")
@@ -79,6 +91,7 @@ class ServiceSettings(BaseSettings):
         30.0, gt=0, description="time within which its body must arrive, and a client must read on [s]"
     )
     max_jobs: int = Field(16, ge=1, description="jobs that may wait")
+    max_client_jobs: int = Field(16, ge=1, description="of one client that wait or run; more are answered 429")
     job_workers: int = Field(2, ge=1, description="jobs that run at once")
     shutdown_s: int = Field(6, ge=0, description="how long running requests may take to end after SIGTERM [s]")
     niceness: int = Field(10, ge=0, le=19, description="of the threads that answer: mapping and arms go first")

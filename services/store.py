@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import secrets
 import threading
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -27,6 +28,12 @@ class TooManyMapsError(InputError):
     """As many maps are served as clients may add."""
 
     http_status = 409
+
+
+class QuotaError(InputError):
+    """A client has as many maps, or bytes of them, as it may."""
+
+    http_status = 403
 
 
 class MapExistsError(InputError):
@@ -57,6 +64,8 @@ class ServedMap:
         generation: number of the map in this process; a later map of the same name has another.
         derived: results computed from the snapshot.
         cameras: further cameras, while it is mapped.
+        world: name of its world frame; a later map of the same name has another, a map that a restart loads the same.
+        owner: client that made it, whose quota it counts in; empty if the service made it.
     """
 
     id: str
@@ -72,11 +81,18 @@ class ServedMap:
     generation: int = 0
     derived: Derived = dataclasses.field(default_factory=Derived, repr=False, compare=False)
     cameras: CameraStates = dataclasses.field(default_factory=CameraStates, repr=False, compare=False)
+    world: str = dataclasses.field(default_factory=lambda: secrets.token_hex(8))
+    owner: str = ""
 
     @property
     def map_version(self) -> int:
         """The state's number, 0 before the first."""
         return self.snapshot.map_version if self.snapshot else 0
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the Gaussians [bytes]."""
+        return self.snapshot.model.nbytes if self.snapshot else 0
 
     @property
     def ready(self) -> Snapshot:
@@ -106,11 +122,12 @@ class MapStore:
     Args:
         bus: receives each new version. If None, a bus is created.
         most: maps that clients may add. If None, any number.
+        most_of_owner: maps of one owner. If None, any number.
     """
 
-    def __init__(self, bus: Bus | None = None, *, most: int | None = None) -> None:
+    def __init__(self, bus: Bus | None = None, *, most: int | None = None, most_of_owner: int | None = None) -> None:
         self.bus = bus or Bus()
-        self._most = most
+        self._most, self._most_of_owner = most, most_of_owner
         self.frames_first = FramesFirst()
         self._lock = threading.Lock()
         self._maps: dict[str, ServedMap] = {}
@@ -129,12 +146,15 @@ class MapStore:
         run: RunFolder | None = None,
         mask: RobotMask | None = None,
         counted: bool = True,
+        world: str | None = None,
+        owner: str = "",
     ) -> ServedMap:
         """Serve a map under a new name. Saved maps that return at a start are not ``counted``: all of them return.
 
         Raises:
             MapExistsError: the name is taken.
             TooManyMapsError: there are as many maps as clients may add.
+            QuotaError: the owner has as many maps as it may.
         """
         with self._lock:
             if map_id in self._maps:
@@ -142,8 +162,24 @@ class MapStore:
             if counted and self._most is not None and len(self._maps) >= self._most:
                 hint = "delete a map, or raise SPLATBOT_MAX_MAPS"
                 raise TooManyMapsError(f"{len(self._maps)} maps are served already.", field="id", hint=hint)
-            number = next(self._generations)
-            served = ServedMap(map_id, source, state, None, snapshot, trajectory, workspace, awaited, run, mask, number)
+            own = sum(served.owner == owner for served in self._maps.values())
+            if counted and owner and self._most_of_owner is not None and own >= self._most_of_owner:
+                hint = "delete one of them, or raise SPLATBOT_MAX_CLIENT_MAPS"
+                raise QuotaError(f"this client has {own} maps already.", field="id", hint=hint)
+            served = ServedMap(
+                map_id,
+                source,
+                state,
+                snapshot=snapshot,
+                trajectory=trajectory,
+                workspace=workspace,
+                awaited=awaited,
+                run=run,
+                mask=mask,
+                generation=next(self._generations),
+                world=world or secrets.token_hex(8),
+                owner=owner,
+            )
             self._put(served)
         return served
 
@@ -210,6 +246,11 @@ class MapStore:
         """
         with self._lock:
             return self._find(map_id, generation)
+
+    def find(self, map_id: str) -> ServedMap | None:
+        """Return the latest version of a map; None if there is no map of that name."""
+        with self._lock:
+            return self._maps.get(map_id)
 
     def list(self) -> tuple[ServedMap, ...]:
         """List the latest versions of all maps in the order of their creation."""

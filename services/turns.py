@@ -1,0 +1,56 @@
+"""Turns at a mapper: the frames in their order, and between two of them whoever needs its whole state."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from splatbot.services.problems import BusyError
+
+
+class Turns:
+    """Gives one thread at a time the mapper. A thread that waits between frames comes before the next frame."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._taken = False
+        self._between = 0
+
+    @contextmanager
+    def frame(self) -> Iterator[None]:
+        """Enter while a frame is mapped."""
+        with self._changed:
+            self._changed.wait_for(lambda: not self._taken and not self._between)
+            self._taken = True
+        try:
+            yield
+        finally:
+            self._leave()
+
+    @contextmanager
+    def between_frames(self, timeout_s: float) -> Iterator[None]:
+        """Enter once the frame in work is mapped; the next frame waits.
+
+        Raises:
+            BusyError: the frame takes longer than ``timeout_s`` [s].
+        """
+        with self._changed:
+            self._between += 1
+            try:
+                free = self._changed.wait_for(lambda: not self._taken, timeout_s)
+                self._taken = self._taken or free
+            finally:
+                self._between -= 1
+                self._changed.notify_all()
+        if not free:
+            raise BusyError(f"the mapper is at work for {timeout_s:g} s already.", hint="try again later")
+        try:
+            yield
+        finally:
+            self._leave()
+
+    def _leave(self) -> None:
+        with self._changed:
+            self._taken = False
+            self._changed.notify_all()

@@ -1,0 +1,392 @@
+"""Versions of maps on disk: saved states to which a map can go back, and which can be merged and compared."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import re
+import secrets
+import shutil
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from splatbot.atomic import replace as rename
+from splatbot.atomic import sync_folder
+from splatbot.checksums import NAME as SUMS
+from splatbot.checksums import check_folder, write_sums
+from splatbot.errors import FormatError, InputError, SplatbotError
+from splatbot.run.state import Checkpoint
+from splatbot.run.state.checkpoint import FOLDER as STATE
+from splatbot.run.state.checkpoint import LogPlace
+from splatbot.services.library import read_map, write_map
+from splatbot.services.problems import disk_error
+from splatbot.services.store import ServedMap
+from splatbot.services.version_index import Version, VersionIndex
+from splatbot.slam import Slam
+
+_log = logging.getLogger(__name__)
+
+FOLDER = ".versions"
+"""Name in the data folder; no map has a name with a dot."""
+_MAP = "map"  # next to the folder `state` of the mapper
+_FILES = re.compile(r"[0-9a-f]{16}")
+_DRAFT = ".draft"
+
+
+class VersionNotFoundError(InputError):
+    """No version of that number."""
+
+    http_status = 404
+
+
+class VersionInUseError(InputError):
+    """The map answers from the version, or a request works on it."""
+
+    http_status = 409
+
+
+class VersionsFullError(InputError):
+    """There is no room for another version."""
+
+    http_status = 409
+
+
+class VersionsOffError(InputError):
+    """The service has no folder for versions."""
+
+    http_status = 409
+
+
+class DamagedVersionError(SplatbotError):
+    """Files of a version are missing or altered."""
+
+
+class Versions:
+    """Versions of all maps: immutable files below ``files``, and the index ``index.sqlite``.
+
+    The files of a version are complete and on the disk before the index names them. A deleted version leaves the index
+    before its files go. So a process that is killed leaves at most files that no version names, and the next start
+    removes them. The process must own the folder.
+
+    Args:
+        folder: created if it does not exist.
+        most: versions of one map.
+        most_bytes: size of all versions [bytes].
+        served: returns the present state of a map; None if there is no such map.
+
+    Raises:
+        FormatError: the index is damaged.
+        SaveError: the folder cannot be written to.
+    """
+
+    def __init__(
+        self, folder: Path, *, most: int, most_bytes: int, served: Callable[[str], ServedMap | None] = lambda _: None
+    ) -> None:
+        self.files = folder / "files"
+        self._most, self._most_bytes = most, most_bytes
+        self._served = served
+        self._lock = threading.RLock()  # of the index with the pins: a version that is pinned stays
+        self._pins: Counter[str] = Counter()  # of folders
+        try:
+            self.files.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise disk_error(error) from error
+        self._index = VersionIndex(folder / "index.sqlite")
+        self._sweep()
+        self._count_bytes()
+
+    def of_map(self, map_id: str) -> list[Version]:
+        """Return the versions of a map by number."""
+        return self._index.of_map(map_id)
+
+    def get(self, map_id: str, number: int) -> Version:
+        """Return a version.
+
+        Raises:
+            VersionNotFoundError: there is none of that number.
+        """
+        found = next((version for version in self.of_map(map_id) if version.number == number), None)
+        if found is None:
+            hint = f"GET /v1/maps/{map_id}/versions lists them"
+            raise VersionNotFoundError(f"map {map_id!r} has no version {number}.", field="version", hint=hint)
+        return found
+
+    def in_use(self, served: ServedMap) -> Version | None:
+        """Return the newest version that holds the present state of a map; None if that state is not saved."""
+        return next((v for v in reversed(self.of_map(served.id)) if _holds(v, served)), None)
+
+    def bytes_of(self, owner: str) -> int:
+        """Return the size of the versions of a client [bytes]."""
+        return self._bytes[owner]
+
+    def save(
+        self,
+        served: ServedMap,
+        slam: Slam | None,
+        *,
+        owner: str,
+        label: str | None = None,
+        note: str | None = None,
+        check: Callable[[int], None] = lambda _size: None,
+    ) -> Version:
+        """Save the present state of a map as a new version.
+
+        Args:
+            served: the map. If its state is saved already and nothing maps it, the new version shares the files.
+            slam: its mapper between two frames. If None, nothing maps it.
+            owner: client whose quota the version counts in.
+            label, note: texts of the client.
+            check: called with the size [bytes] before the version is there; its errors prevent the version.
+
+        Raises:
+            MapNotReadyError: the map has no state.
+            VersionsFullError: there is no room, because the other versions have labels or are in use.
+            SaveError: it cannot be written.
+        """
+        snapshot = served.ready
+        known = self.in_use(served) if slam is None else None
+        earlier = [v for v in self.of_map(served.id) if v.world == served.world and v.map_version <= served.map_version]
+        version = Version(
+            map=served.id,
+            number=self._index.next_number(served.id),
+            created=time.time(),
+            label=label,
+            note=note,
+            owner=owner,
+            world=served.world,
+            map_version=served.map_version,
+            gaussians=len(snapshot.model),
+            keyframes=len(slam.keyframes) if slam is not None else 0,
+            bytes=0,
+            checksum="",
+            folder="",
+            parent=earlier[-1].number if earlier else None,
+            restored_from=None,
+        )
+        if known is not None:
+            shared = {name: getattr(known, name) for name in ("keyframes", "bytes", "checksum", "folder")}
+            return self._add(replace(version, **shared))
+        name = secrets.token_hex(8)
+        draft = self.files / f"{name}{_DRAFT}"
+        try:
+            (draft / _MAP).mkdir(parents=True)
+            write_map(served, snapshot, draft / _MAP)
+            if slam is not None:
+                save_slam(slam, draft, served.source)
+            size = _size_of(draft)
+            check(size)
+            version = replace(version, bytes=size, checksum=_checksum(draft), folder=name)
+            with self._lock:
+                self._make_room(version, size)
+            sync_folder(draft)
+            rename(draft, self.files / name)
+        except OSError as error:
+            raise disk_error(error) from error
+        finally:
+            shutil.rmtree(draft, ignore_errors=True)
+        try:
+            return self._add(version)
+        except SplatbotError:
+            self._remove_files(name)
+            raise
+
+    def repeat(self, version: Version, *, owner: str, map_version: int) -> Version:
+        """Record that a map went back to a version: a new version that shares its files.
+
+        Raises:
+            VersionsFullError: there is no room for another version.
+            SaveError: the index cannot be written.
+        """
+        number = self._index.next_number(version.map)
+        note = f"version {version.number} again"
+        return self._add(
+            replace(
+                version,
+                number=number,
+                created=time.time(),
+                label=None,
+                note=note,
+                owner=owner,
+                map_version=map_version,
+                parent=version.number,
+                restored_from=version.number,
+            )
+        )
+
+    def delete(self, version: Version) -> None:
+        """Delete a version.
+
+        Raises:
+            VersionInUseError: the map answers from it, or a request works on it.
+            SaveError: the index cannot be written.
+        """
+        with self._lock:
+            if self._pins[version.folder]:
+                hint = "wait for the merge, comparison or restoration"
+                raise VersionInUseError(f"a request works on version {version.number}.", field="version", hint=hint)
+            if self._is_in_use(version):
+                hint = "restore another version first, or delete the map"
+                raise VersionInUseError(f"the map answers from version {version.number}.", field="version", hint=hint)
+            self._drop(version)
+
+    def remove_map(self, map_id: str) -> None:
+        """Remove all versions of a map; files that a request reads go when it ends.
+
+        Raises:
+            SaveError: the index cannot be written.
+        """
+        with self._lock:
+            gone = self.of_map(map_id)
+            self._index.remove_map(map_id)
+            for version in gone:
+                self._remove_files(version.folder)
+            self._count_bytes()
+
+    @contextmanager
+    def pinned(self, version: Version) -> Iterator[Path]:
+        """Enter with the checked files of a version, which stay until the end.
+
+        Yields:
+            Folder whose ``state`` holds the mapper's state, as that of a run.
+
+        Raises:
+            VersionNotFoundError: the version was deleted.
+            DamagedVersionError: files are missing or altered.
+        """
+        with self._lock:
+            if self.get(version.map, version.number) != version:  # another map took the name
+                raise VersionNotFoundError(f"version {version.number} was deleted.", field="version")
+            self._pins[version.folder] += 1
+        try:
+            _check(version, self.files / version.folder)
+            yield self.files / version.folder
+        finally:
+            with self._lock:
+                self._pins[version.folder] -= 1
+                self._remove_files(version.folder)
+
+    def _add(self, version: Version) -> Version:
+        """Add a version whose files are there."""
+        with self._lock:
+            self._make_room(version, 0)
+            self._index.add(version)
+            self._count_bytes()
+        return version
+
+    def _make_room(self, version: Version, size: int) -> None:
+        """Delete the oldest versions without a label until a version of ``size`` bytes fits.
+
+        Those of the same map make room for its number, and those of the same client for its bytes.
+
+        Raises:
+            VersionsFullError: the others have labels or are in use.
+        """
+        while len(own := self.of_map(version.map)) >= self._most:
+            self._drop_oldest(own, f"map {version.map!r} has {len(own)} versions already.", "SPLATBOT_MAX_VERSIONS")
+        while _total(every := self._index.every()) + size > self._most_bytes:
+            own = [v for v in every if v.owner == version.owner]
+            why = f"the versions have {_total(every)} bytes already, and this one has {size}."
+            self._drop_oldest(own, why, "SPLATBOT_MAX_VERSIONS_BYTES")
+
+    def _drop_oldest(self, versions: list[Version], why: str, setting: str) -> None:
+        free = (v for v in versions if v.label is None and not self._pins[v.folder] and not self._is_in_use(v))
+        oldest = next(free, None)
+        if oldest is None:
+            hint = f"delete a version, or raise {setting}"
+            raise VersionsFullError(why, field="versions", hint=hint)
+        _log.info("version %d of map %s makes room", oldest.number, oldest.map)
+        self._drop(oldest)
+
+    def _is_in_use(self, version: Version) -> bool:
+        served = self._served(version.map)
+        return served is not None and self.in_use(served) == version
+
+    def _drop(self, version: Version) -> None:
+        self._index.remove(version)
+        self._remove_files(version.folder)
+        self._count_bytes()
+
+    def _remove_files(self, name: str) -> None:
+        """Remove files that no version names any more, and no request reads."""
+        if not self._pins[name] and all(version.folder != name for version in self._index.every()):
+            shutil.rmtree(self.files / name, ignore_errors=True)
+
+    def _count_bytes(self) -> None:
+        """Count the bytes of each client after a change."""
+        self._index.keep_reserve()
+        every = self._index.every()
+        self._bytes = Counter({o: _total([v for v in every if v.owner == o]) for o in {v.owner for v in every}})
+
+    def _sweep(self) -> None:
+        """Remove what a killed process left: drafts, and files that no version names."""
+        named = {version.folder for version in self._index.every()}
+        for path in self.files.iterdir():
+            if path.name not in named and _FILES.fullmatch(path.name.removesuffix(_DRAFT)):
+                shutil.rmtree(path, ignore_errors=True)
+
+
+def read_version(version: Version, folder: Path) -> dict[str, Any]:
+    """Read the map of a version from its checked files, as arguments of :meth:`MapStore.add`.
+
+    Raises:
+        DamagedVersionError: a file is damaged.
+    """
+    try:
+        return read_map(folder / _MAP)
+    except InputError as error:
+        raise _damaged(version, error) from error
+
+
+def save_slam(slam: Slam, folder: Path, source: str) -> None:
+    """Save the state of a mapper between two frames into ``folder/state``, with checksums."""
+    frames = len(slam.results)
+    Checkpoint(folder, 0.0).save(slam, {}, LogPlace(source, "", frames, None, frames), slam.config)
+    write_sums(folder / STATE, [path.name for path in (folder / STATE).iterdir()])
+
+
+def _check(version: Version, folder: Path) -> None:
+    """Check all files of a version.
+
+    Raises:
+        DamagedVersionError: one is missing or altered.
+    """
+    try:
+        if _checksum(folder) != version.checksum:
+            raise FormatError("is damaged: its checksum is not that of the index.", file=folder)
+        for part in sorted(folder.iterdir()):
+            check_folder(part)
+    except (InputError, OSError) as error:
+        raise _damaged(version, error) from error
+
+
+def _damaged(version: Version, error: Exception) -> DamagedVersionError:
+    _log.error("version %d of map %s is damaged: %s", version.number, version.map, error)
+    hint = "delete it, and use another version; the service's log names the file"
+    return DamagedVersionError(f"version {version.number} of map {version.map!r} is damaged.", hint=hint)
+
+
+def _holds(version: Version, served: ServedMap) -> bool:
+    return (version.world, version.map_version) == (served.world, served.map_version)
+
+
+def _checksum(folder: Path) -> str:
+    """Return the SHA-256 of the lists of checksums of a version's folders."""
+    digest = hashlib.sha256()
+    for part in sorted(path.name for path in folder.iterdir()):
+        digest.update(f"{part}\n".encode() + (folder / part / SUMS).read_bytes())
+    return digest.hexdigest()
+
+
+def _size_of(folder: Path) -> int:
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+
+
+def _total(versions: list[Version]) -> int:
+    """Return the size of versions [bytes]; files that several share count once."""
+    return sum({version.folder: version.bytes for version in versions}.values())
