@@ -61,6 +61,9 @@ COMMANDS = {
     "export": _Command("splatbot.cli.export", "export", "Write a map as mesh, points, distance grid or occupancy."),
     "convert": _Command("splatbot.cli.convert", "convert", "Write a map in another format of Gaussian splats."),
     "compact": _Command("splatbot.cli.compact", "compact", "Write a map of fewer Gaussians that hits all it hit."),
+    "tile": _Command(
+        "splatbot.cli.tile", "tile", "Write a map as tiles on disk, which are loaded only where a query needs them."
+    ),
     "compare": _Command("splatbot.cli.compare", "compare", "Compare two maps as one HTML page with sliders."),
     "demo": _Command("splatbot.cli.demo", "demo", "Record, map, serve and query a synthetic tabletop."),
     "robot": _Command("splatbot.cli.robot", "robot", "Add a robot arm from a URDF, or describe a stored one."),

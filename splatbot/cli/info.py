@@ -13,7 +13,7 @@ from splatbot.cli.doubts import camera_doubts
 from splatbot.cli.paths import check_camera, check_output
 from splatbot.cli.tables import print_table
 from splatbot.errors import InputError
-from splatbot.layouts import is_map, log_kind, map_file
+from splatbot.layouts import is_map, is_tiled_map, log_kind, map_file
 
 if TYPE_CHECKING:
     from splatbot.logs import Log
@@ -60,8 +60,8 @@ def info(
         splatbot info runs/latest --fit-plane
 
     Args:
-        path: a map file, a run folder (its map), synthetic:SCENE, or a recording. Folders are of TUM, Replica,
-            7-Scenes, Open3D, ScanNet, Nerfstudio, LeRobot or rosbag2; files are .mcap, .bag, .sens or .r3d.
+        path: a map file, a run folder (its map), a tiled map, synthetic:SCENE, or a recording. Folders are of TUM,
+            Replica, 7-Scenes, Open3D, ScanNet, Nerfstudio, LeRobot or rosbag2; files are .mcap, .bag, .sens or .r3d.
         camera: intrinsics of the log: tum_fr1, tum_fr2, tum_fr3 or an intrinsics.json.
         fit_plane: estimate the plane of the table or floor and propose a base of a robot. They are written to
             scene.yaml next to the map, with the picture scene.png. A doubtful estimate is not written.
@@ -74,6 +74,8 @@ def info(
 
     if up is not None and not fit_plane:
         raise InputError("goes with --fit-plane.", field="--up", hint="give both")
+    if is_tiled_map(path):
+        return _describe_tiled(path, fit_plane=fit_plane, picture=picture)
     if is_map(path):
         if picture is not None:
             raise InputError("needs a log.", field="--picture", hint=f"splatbot render {path}")
@@ -95,6 +97,16 @@ def info(
     print_table(describe_log(log), title=None if streams else path)
     if picture is not None:
         _write_picture(log, picture)
+    return 0
+
+
+def _describe_tiled(path: str, *, fit_plane: bool, picture: Path | None) -> int:
+    from splatbot.cli.tiled import describe_tiles
+
+    for name, given in (("--fit-plane", fit_plane), ("--picture", picture is not None)):
+        if given:
+            raise InputError("is not for a tiled map.", field=name, hint="give the map that it was made of")
+    print_table(describe_tiles(Path(path)), title=path)
     return 0
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from splatbot.cli.paths import check_file, check_output
-from splatbot.layouts import map_file
+from splatbot.layouts import is_tiled_map, map_file
 
 if TYPE_CHECKING:
     import numpy as np
@@ -36,6 +36,8 @@ def render(
     fov: Annotated[float, tyro.conf.arg(metavar="DEG")] = 60.0,
     video: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
     seconds: Annotated[float, tyro.conf.arg(metavar="S")] = 8.0,
+    pixel_error: Annotated[float | None, tyro.conf.arg(metavar="PX")] = None,
+    memory_mb: Annotated[float | None, tyro.conf.arg(metavar="MB")] = None,
 ) -> int:
     """Render a view of a map to a PNG, or a fly-through to a video.
 
@@ -50,7 +52,7 @@ def render(
         splatbot render runs/latest --video fly.mp4 --seconds 10
 
     Args:
-        map_: a map file, or a run folder.
+        map_: a map file, a run folder, or a tiled map, of which only the tiles in view are loaded.
         mode: colour, depth, surface normals or opacity.
         out: PNG to write; by default NAME-MODE.png here.
         pose: T_world_camera: position [m] and quaternion (w x y z); camera axes x right, y down, z forward.
@@ -60,9 +62,14 @@ def render(
         fov: horizontal field of view [deg].
         video: MP4 of a fly-through, instead of a PNG; a map file needs --trajectory.
         seconds: length of the video [s].
+        pixel_error: of a tiled map: largest edge of a cell of merged Gaussians [px], by default 1. 0 is exact.
+        memory_mb: of a tiled map: memory of tiles [MB], by default 32.
     """
     width, height = _parse_size(size)
-    file, path = map_file(map_), trajectory or _own_trajectory(map_, index, video)
+    is_tiled = is_tiled_map(map_)
+    file = map_ if is_tiled else map_file(map_)
+    path = trajectory or (None if is_tiled else _own_trajectory(map_, index, video))
+    _check_tiled(is_tiled, video, {"--pixel-error": pixel_error, "--memory-mb": memory_mb})
     check_file(trajectory, "--trajectory")
     check_output(out, folder=False)
     check_output(video, folder=False)
@@ -74,8 +81,11 @@ def render(
     from splatbot.rasterize.views import default_view, render_view, to_png
 
     given = _given_pose(pose, path, index) if video is None else None
-    model = GaussianModel.load(file)
-    camera, T_world_camera = default_view(model, width=width, height=height, fov_deg=fov)
+    if is_tiled:
+        model, camera, T_world_camera = _load_view(file, given, (width, height, fov), pixel_error, memory_mb)
+    else:
+        model = GaussianModel.load(file)
+        camera, T_world_camera = default_view(model, width=width, height=height, fov_deg=fov)
     if video is not None:
         assert path is not None
         _fly(model, camera, path, video, mode, seconds)
@@ -86,6 +96,44 @@ def render(
         image.write(to_png(view, mode))
     print(target)
     return 0
+
+
+def _check_tiled(is_tiled: bool, video: Path | None, given: dict[str, float | None]) -> None:
+    """Refuse options of tiled maps for other maps, and a video of a tiled map.
+
+    Raises:
+        InputError: an option does not fit.
+    """
+    from splatbot.errors import InputError
+
+    if is_tiled and video is not None:
+        raise InputError("needs a whole map.", field="--video", hint="give the map that the tiled map was made of")
+    for name, value in given.items():
+        if not is_tiled and value is not None:
+            raise InputError("is for a tiled map.", field=name, hint="write one with `splatbot tile`")
+
+
+def _load_view(
+    folder: Path,
+    given: NDArray[np.float64] | None,
+    image: tuple[int, int, float],
+    pixel_error: float | None,
+    memory_mb: float | None,
+) -> tuple[GaussianModel, Camera, NDArray[np.float64]]:
+    """Return the Gaussians of a tiled map for a view, its camera and pose; the coarsest level gives a default pose."""
+    from splatbot.cli.messages import print_message
+    from splatbot.rasterize.views import default_view
+    from splatbot.tiles.tiled_map import CONSTANTS, TiledMap
+
+    error = CONSTANTS.pixel_error if pixel_error is None else pixel_error
+    with TiledMap(folder, memory_mb=CONSTANTS.memory_mb if memory_mb is None else memory_mb) as tiles:
+        width, height, fov = image
+        camera, T_world_camera = default_view(tiles.overview(), width=width, height=height, fov_deg=fov)
+        T_world_camera = T_world_camera if given is None else given
+        view = tiles.in_view(camera, T_world_camera, pixel_error=error)
+    if view.pixel_error > error:
+        print_message("warning", f"the memory allows a pixel error of {view.pixel_error:.2f}, not {error:g} px")
+    return view.model, camera, T_world_camera
 
 
 def _own_trajectory(path: Path, index: int | None, video: Path | None) -> Path | None:

@@ -1,0 +1,41 @@
+"""Descriptions of tiled maps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from splatbot.layouts import TILES_NAME
+
+
+def describe_tiles(folder: Path) -> list[tuple[str, str]]:
+    """Describe a tiled map as names and values, with a row for each level of detail.
+
+    Raises:
+        FormatError: the index is damaged.
+    """
+    from splatbot.results.units import count, megabytes, metres
+    from splatbot.tiles.index import DATA_NAME, read_index
+
+    index = read_index(folder)
+    tiles = index.tiles
+    size = sum((folder / name).stat().st_size for name in (DATA_NAME, TILES_NAME))
+    rows = [
+        ("Gaussians", count(index.gaussians)),
+        ("SH degree", str(index.sh_degree)),
+        ("map", index.source),
+        ("files", megabytes(size)),
+        ("tiles", count(len(tiles))),
+    ]
+    for k, axis in enumerate("xyz" if tiles else ""):
+        low, high = min(tile.low[k] for tile in tiles), max(tile.high[k] for tile in tiles)
+        rows.append((f"{axis} [m]", f"{low:.3f} to {high:.3f}"))
+    levels = [0] * len(tiles)
+    for number in reversed(range(len(tiles))):
+        for child in tiles[number].children:
+            levels[child] = levels[number] + 1
+    for level in range(max(levels, default=-1) + 1):
+        here = [tile for tile, own in zip(tiles, levels, strict=True) if own == level]
+        edges = [tile.error for tile in here if tile.children]
+        cells = f"cells of {metres(min(edges))} to {metres(max(edges))}" if edges else "exact"
+        rows.append((f"level {level}", f"{count(sum(t.count for t in here))} Gaussians, {len(here)} tiles, {cells}"))
+    return rows
