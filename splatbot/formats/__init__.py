@@ -124,6 +124,6 @@ def find_format(path: str | Path) -> MapFormat:
 
 
 def _has_chunks(path: Path) -> bool:
-    from splatbot.formats.ply import read_ply_header
+    from splatbot.formats.ply_file import read_ply_header
 
-    return any(name == "chunk" for name, _, _ in read_ply_header(path))
+    return any(element.name == "chunk" for element in read_ply_header(path).elements)

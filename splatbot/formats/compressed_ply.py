@@ -15,9 +15,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from plyfile import PlyData
 
-from splatbot.atomic import atomic_write
 from splatbot.checksums import check_file
 from splatbot.errors import FormatError
 from splatbot.formats.checks import check_count, damaged
@@ -34,7 +32,7 @@ from splatbot.formats.conventions import (
     to_channel_major,
     warn_limited,
 )
-from splatbot.formats.ply import read_ply
+from splatbot.formats.ply_file import Rows, read_ply, write_ply
 from splatbot.formats.quantize import (
     Array,
     Codes,
@@ -68,7 +66,7 @@ def load_compressed_ply(path: str | Path) -> GaussianModel:
         FormatError: no such file, truncated, damaged, or a property is missing.
     """
     check_file(path)
-    ply = read_ply(path)
+    ply = read_ply(path, ("chunk", "vertex", "sh"))
     vertex, chunk = _element(path, ply, "vertex", _PACKED), _element(path, ply, "chunk", [])
     count = len(vertex)
     check_count(path, count, "vertex")
@@ -106,7 +104,7 @@ def save_compressed_ply(model: GaussianModel, path: str | Path) -> None:
     warn_limited(path, "harmonics", splats.sh[:, 1:], -SH_LIMIT, SH_LIMIT)
     order = morton_order(splats.means)
     means, quats, log_scales, logits, sh = (values[order] for values in splats)
-    count, colors = len(means), colors_of(sh).astype(np.float32)
+    colors = colors_of(sh).astype(np.float32)
     largest, others = to_smallest_three(quats)
     position, position_limits = _squeeze(means, _BITS)
     scale, scale_limits = _squeeze(log_scales, _BITS)
@@ -116,39 +114,43 @@ def save_compressed_ply(model: GaussianModel, path: str | Path) -> None:
     color = _pack(np.concatenate([color, opacity[:, None]], axis=1), (8, 8, 8, 8))
     chunks = np.concatenate([position_limits, scale_limits, color_limits], axis=1)
     rest = to_channel_major(sh)
-    header = ["ply", "format binary_little_endian 1.0", "comment splatbot", f"element chunk {len(chunks)}"]
-    header += [f"property float {name}" for limits in (_POSITION, _SCALE, _COLOR) for part in limits for name in part]
-    header += [f"element vertex {count}", *(f"property uint {name}" for name in _PACKED)]
+    limits = [name for part in (_POSITION, _SCALE, _COLOR) for names in part for name in names]
+    packed = np.stack((_pack(position, _BITS), rotation, _pack(scale, _BITS), color), axis=1)
+    elements = {
+        "chunk": _rows(chunks, "<f4", limits),
+        "vertex": _rows(packed, "<u4", _PACKED),
+    }
     if rest.shape[1]:
-        header += [f"element sh {count}", *(f"property uchar f_rest_{i}" for i in range(rest.shape[1]))]
-    with atomic_write(path) as file:
-        file.write(("\n".join(header) + "\nend_header\n").encode())
-        file.write(chunks.astype("<f4").tobytes())
-        words = (_pack(position, _BITS), rotation, _pack(scale, _BITS), color)
-        file.write(np.stack(words, axis=1).astype("<u4").tobytes())
-        file.write(np.clip(np.floor((rest / (2 * SH_LIMIT) + 0.5) * 256), 0, 255).astype(np.uint8).tobytes())
+        codes = np.clip(np.floor((rest / (2 * SH_LIMIT) + 0.5) * 256), 0, 255)
+        elements["sh"] = _rows(codes, "u1", [f"f_rest_{i}" for i in range(rest.shape[1])])
+    write_ply(path, elements)
 
 
-def _element(path: str | Path, ply: PlyData, name: str, properties: list[str]) -> NDArray[np.void]:
+def _rows(table: NDArray[np.generic], kind: str, names: list[str]) -> Rows:
+    """Return a table (N, P) as N rows of named numbers of one type."""
+    return table.astype(kind, order="C").view([(name, kind) for name in names]).reshape(len(table))
+
+
+def _element(path: str | Path, ply: dict[str, Rows], name: str, properties: list[str]) -> Rows:
     if name not in ply:
         hint = "give a compressed PLY file of splats"
         raise FormatError(f"has no element {name}.", file=path, field=name, hint=hint)
-    rows: NDArray[np.void] = ply[name].data
+    rows = ply[name]
     for wanted in properties:
         _check_property(path, rows, wanted)
     return rows
 
 
-def _check_property(path: str | Path, rows: NDArray[np.void], name: str) -> None:
+def _check_property(path: str | Path, rows: Rows, name: str) -> None:
     if name not in (rows.dtype.names or ()) or rows.dtype[name].kind not in "uif":
         raise FormatError(f"has no numbers {name}.", file=path, field=name, hint="export the map again")
 
 
-def _harmonics(path: str | Path, ply: PlyData, count: int) -> Table:
+def _harmonics(path: str | Path, ply: dict[str, Rows], count: int) -> Table:
     """Return the harmonics beyond DC (N, K - 1, 3) of the element sh."""
     if "sh" not in ply:
         return np.zeros((count, 0, 3), np.float32)
-    rows: NDArray[np.void] = ply["sh"].data
+    rows = ply["sh"]
     names = rows.dtype.names or ()
     if len(rows) != count or len(names) not in (9, 24, 45):
         raise damaged(path, "sh", f"{len(rows)} rows of {len(names)} harmonics for {count} Gaussians")
@@ -176,7 +178,7 @@ def _pack(fields: Codes, bits: tuple[int, ...]) -> Codes:
 
 def _spread(
     path: str | Path,
-    chunk: NDArray[np.void],
+    chunk: Rows,
     names: tuple[list[str], list[str]],
     codes: NDArray[np.int64],
     steps: NDArray[np.int64],

@@ -12,17 +12,17 @@ The `vertex` element has these float32 properties:
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
-from plyfile import PlyData, PlyElement, PlyParseError
 
-from splatbot.atomic import atomic_write
 from splatbot.checksums import check_file
 from splatbot.errors import FormatError
-from splatbot.formats.checks import MAX_GAUSSIANS, Table, check_finite, damaged, replace_degenerate
+from splatbot.formats.checks import Table, check_finite, replace_degenerate
 from splatbot.formats.conventions import from_channel_major, to_channel_major
+from splatbot.formats.ply_file import Rows, read_ply, write_ply
 from splatbot.gaussians.model import GaussianModel
 
 _MEANS, _NORMALS = ["x", "y", "z"], ["nx", "ny", "nz"]
@@ -30,10 +30,6 @@ _DC = [f"f_dc_{i}" for i in range(3)]
 _SCALES, _QUATS = [f"scale_{i}" for i in range(3)], [f"rot_{i}" for i in range(4)]
 _REST_COUNTS = (0, 9, 24, 45, 72)  # 3 ((degree + 1)² - 1)
 _BOOKKEEPING = {"observations": 1, "anchors": -1, "uncertainty": 0, "misses": 0}  # with the value if absent
-
-_MAX_HEADER = 2**20  # bytes
-_SIZES = {"char": 1, "uchar": 1, "short": 2, "ushort": 2, "int": 4, "uint": 4, "float": 4, "double": 8}
-_SIZES |= {"int8": 1, "uint8": 1, "int16": 2, "uint16": 2, "int32": 4, "uint32": 4, "float32": 4, "float64": 8}
 
 
 def load_ply(path: str | Path) -> GaussianModel:
@@ -48,7 +44,7 @@ def load_ply(path: str | Path) -> GaussianModel:
     """
     check_file(path)
     vertex = _read_vertices(path)
-    present = [p.name for p in vertex.properties]
+    present = vertex.dtype.names or ()
     rest = _rest_names(path, present)
     names = [*_MEANS, *_DC, *rest, "opacity", *_SCALES, *_QUATS]
     missing = [name for name in names if name not in present]
@@ -97,75 +93,23 @@ def save_ply(model: GaussianModel, path: str | Path, *, normals: bool = True, bo
         (_SCALES, model.log_scales.detach().numpy()),
         (_QUATS, model.quats.detach().numpy()),
     ]
-    dtype = [(name, "<f4") for names, _ in columns for name in names]
-    rows = np.concatenate([values for _, values in columns], axis=1, dtype="<f4").view(np.uint8)
     if bookkeeping:
-        for name in _BOOKKEEPING:
-            values = getattr(model, name).detach().numpy()[:, None]
-            dtype.append((name, "<f4" if values.dtype == np.float32 else "<i4"))
-            rows = np.concatenate([rows, values.astype(dtype[-1][1]).view(np.uint8)], axis=1)
-    element = PlyElement.describe(rows.view(np.dtype(dtype)).reshape(n), "vertex")
-    with atomic_write(path) as file:
-        PlyData([element], byte_order="<").write(file)
+        columns += [([name], getattr(model, name).detach().numpy()[:, None]) for name in _BOOKKEEPING]
+    dtype = np.dtype([(name, values.dtype.newbyteorder("<")) for names, values in columns for name in names])
+    words = np.concatenate([values.view(np.uint32) for _, values in columns], axis=1, dtype="<u4")
+    write_ply(path, {"vertex": words.view(dtype).reshape(n)})
 
 
-def read_ply(path: str | Path) -> PlyData:
-    """Read any PLY file, after its header's counts are checked against the size of the file.
-
-    Raises:
-        FormatError: it cannot be read, is damaged or truncated, or claims too many rows.
-    """
-    try:
-        for element, count, least in read_ply_header(path):
-            if not 0 <= count <= MAX_GAUSSIANS or count * least > Path(path).stat().st_size:
-                raise damaged(path, element, f"the header claims {count:,} rows")
-        return PlyData.read(str(path))
-    except OSError as error:
-        raise FormatError(f"cannot be read ({error.strerror}).", file=path, hint="give a 3DGS PLY file") from error
-    except (PlyParseError, ValueError, MemoryError, OverflowError) as error:  # of a damaged header
-        raise damaged(path, "vertex", error) from error
-
-
-def read_ply_header(path: str | Path) -> list[tuple[str, int, int]]:
-    """Read the elements of a PLY file: name, number of rows, and the least bytes that a row takes in the file.
-
-    Raises:
-        FormatError: the header is damaged or truncated.
-        OSError: the file cannot be read.
-    """
-    with Path(path).open("rb") as file:
-        header, end, _ = file.read(_MAX_HEADER).partition(b"end_header")
-    if not end:
-        raise damaged(path, "vertex", "the header has no end")
-    elements: list[tuple[str, int, int]] = []
-    is_text = False
-    try:
-        for line in header.decode("ascii", "replace").splitlines():
-            words = line.split()
-            if words[:1] == ["format"]:
-                is_text = words[1] == "ascii"
-            elif words[:1] == ["element"]:
-                elements.append((words[1], int(words[2]), 0))
-            elif words[:1] == ["property"]:
-                name, count, least = elements[-1]
-                size = _SIZES[words[2] if words[1] == "list" else words[1]]
-                elements[-1] = name, count, least + (1 if is_text else size)
-    except (LookupError, ValueError) as error:
-        raise damaged(path, "vertex", error) from error
-    return elements
-
-
-def _read_vertices(path: str | Path) -> PlyElement:
-    ply = read_ply(path)
-    names = [element.name for element in ply.elements]
-    if "chunk" in names:
+def _read_vertices(path: str | Path) -> Rows:
+    elements = read_ply(path, ("chunk", "vertex"))
+    if "chunk" in elements:
         raise FormatError("is a compressed PLY.", file=path, field="chunk", hint="load it with load_gaussians")
-    if "vertex" not in names:
-        raise FormatError(f"has elements {names}, no vertex.", file=path, field="vertex", hint="give a 3DGS PLY file")
-    return ply["vertex"]
+    if "vertex" not in elements:
+        raise FormatError("has no element vertex.", file=path, field="vertex", hint="give a 3DGS PLY file")
+    return elements["vertex"]
 
 
-def _rest_names(path: str | Path, present: list[str]) -> list[str]:
+def _rest_names(path: str | Path, present: Sequence[str]) -> list[str]:
     count = sum(name.startswith("f_rest_") for name in present)
     if count not in _REST_COUNTS:
         raise FormatError(
@@ -177,23 +121,23 @@ def _rest_names(path: str | Path, present: list[str]) -> list[str]:
     return [f"f_rest_{i}" for i in range(count)]
 
 
-def _table(vertex: PlyElement, names: list[str]) -> Table:
-    """Return the named properties as columns (N, P), in one pass over memory if all properties are float32."""
-    data = vertex.data
-    if {data.dtype[name] for name in data.dtype.names} == {np.dtype("<f4")}:
-        order = [data.dtype.names.index(name) for name in names]
-        return data.view("<f4").reshape(len(data), len(data.dtype.names))[:, order]
-    return np.stack([data[name].astype(np.float32) for name in names], axis=1)
+def _table(vertex: Rows, names: list[str]) -> Table:
+    """Return the named properties as columns (N, P), in one pass over memory if all have 4 bytes as float32 has."""
+    kinds = [vertex.dtype[name] for name in vertex.dtype.names or ()]
+    if {kind.itemsize for kind in kinds} == {4} and {vertex.dtype[name] for name in names} == {np.dtype("<f4")}:
+        order = [list(vertex.dtype.names or ()).index(name) for name in names]
+        return vertex.view("<f4").reshape(len(vertex), len(kinds))[:, order]
+    return np.stack([vertex[name].astype(np.float32) for name in names], axis=1)
 
 
 def _tensor(values: Table) -> torch.Tensor:
     return torch.from_numpy(values.astype(np.float32, order="C"))  # astype copies: the table can be freed
 
 
-def _column(vertex: PlyElement, present: list[str], name: str, default: int) -> torch.Tensor:
+def _column(vertex: Rows, present: Sequence[str], name: str, default: int) -> torch.Tensor:
     kind = np.float32 if name == "uncertainty" else np.int32
     if name not in present:
-        return torch.from_numpy(np.full(vertex.count, default, kind))
+        return torch.from_numpy(np.full(len(vertex), default, kind))
     return torch.from_numpy(vertex[name].astype(kind))
 
 

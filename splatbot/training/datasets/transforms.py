@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from plyfile import PlyData, PlyParseError
 
 from splatbot.errors import FormatError, LogError
+from splatbot.formats.ply_file import read_ply
 from splatbot.training.datasets.base import TrainingData, TrainingView, sorted_views
 from splatbot.training.datasets.images import Lens, is_image, make_lens, open_photo, photo_size
 
@@ -230,24 +230,19 @@ def read_point_cloud(file: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]
     Raises:
         FormatError: the file is missing or damaged, or a coordinate is NaN or infinite.
     """
-    try:
-        vertex = PlyData.read(str(file))["vertex"].data
-        points = np.stack([vertex[axis].astype(np.float64) for axis in "xyz"], axis=1)
-    except OSError as error:
-        raise FormatError(
-            f"cannot be read ({error.strerror}).",
-            file=file,
-            field="ply_file_path",
-            hint="copy the point cloud, or remove this key",
-        ) from error
-    except (PlyParseError, KeyError, ValueError, TypeError, MemoryError) as error:
-        raise FormatError(
-            f"is no point cloud ({error}).", file=file, field="vertex", hint="write a PLY with x, y, z"
-        ) from error
+    if not is_image(file):
+        hint = "copy the point cloud, or remove this key"
+        raise FormatError("cannot be read: there is no such file.", file=file, field="ply_file_path", hint=hint)
+    vertex = read_ply(file, ["vertex"]).get("vertex", np.zeros(0, [("none", "u1")]))
+    names = vertex.dtype.names or ()
+    missing = [axis for axis in "xyz" if axis not in names]
+    if missing:
+        problem = f"is no point cloud: its vertices have no {', '.join(missing)}."
+        raise FormatError(problem, file=file, field="vertex", hint="write a PLY with x, y, z")
+    points = np.stack([vertex[axis].astype(np.float64) for axis in "xyz"], axis=1)
     if not np.isfinite(points).all():
         row = int(np.argmin(np.isfinite(points).all(axis=1)))
         raise FormatError("holds NaN or infinity.", file=file, field=f"vertex {row}", hint="remove the point")
-    names = vertex.dtype.names
     if not all(name in names and vertex[name].dtype == np.uint8 for name in ("red", "green", "blue")):
         return points, np.full(points.shape, _GREY, np.uint8)
     return points, np.stack([vertex[name] for name in ("red", "green", "blue")], axis=1)

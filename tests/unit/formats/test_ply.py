@@ -309,10 +309,10 @@ def test_a_failed_write_leaves_the_old_file_and_no_litter(tmp_path: Path, monkey
     save_ply(random_model(seed=1), path)
     before = path.read_bytes()
 
-    def fail(self: plyfile.PlyData, stream: object) -> None:
+    def fail(draft: Path, target: Path) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(plyfile.PlyData, "write", fail)
+    monkeypatch.setattr("splatbot.atomic.replace", fail)
     with pytest.raises(KeyboardInterrupt):
         save_ply(random_model(seed=2), path)
     assert path.read_bytes() == before

@@ -113,7 +113,7 @@ def test_point_cloud_of_nerfstudio_comes_with_its_colours(tmp_path: Path) -> Non
     ("text", "message"),
     [
         (None, "ply_file_path: cannot be read"),
-        ("not a ply", "is no point cloud"),
+        ("not a ply", "is damaged"),
         ("ply\nformat ascii 1.0\nelement face 0\nend_header\n", "is no point cloud"),
         ("ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n", "is no point cloud"),
         (
@@ -123,7 +123,7 @@ def test_point_cloud_of_nerfstudio_comes_with_its_colours(tmp_path: Path) -> Non
         ),
         (
             "ply\nformat binary_little_endian 1.0\nelement vertex 99999999999999\nproperty double x\nend_header\n",
-            "is no point cloud",
+            "the header claims",
         ),
     ],
 )
