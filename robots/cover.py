@@ -7,8 +7,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import Bounds, LinearConstraint, milp
-from scipy.sparse import csr_matrix
 
 from splatbot.errors import InputError
 from splatbot.protocols import Array, LinkSpheres
@@ -212,6 +210,9 @@ def _contains(centers: Array, radii: Array, points: Array, fit: SphereFitConstan
 
 def _fewest(contains: NDArray[np.bool_], fit: SphereFitConstants) -> NDArray[np.int64]:
     """Select few rows of (C, P) that contain every column."""
+    from scipy.optimize import Bounds, LinearConstraint, milp
+    from scipy.sparse import csr_matrix
+
     greedy = _greedy(contains)
     _, columns = np.unique(np.packbits(contains, axis=0), axis=1, return_index=True)
     matrix = csr_matrix(contains[:, columns].T.astype(np.float64))

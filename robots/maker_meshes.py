@@ -10,14 +10,17 @@ import importlib.metadata
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from splatbot.errors import InputError
 from splatbot.protocols import Array
 from splatbot.robots.shapes import Mesh, Shape
+
+if TYPE_CHECKING:
+    import trimesh
 
 
 @dataclass(frozen=True)
@@ -101,6 +104,8 @@ def read_shapes(path: Path, link: int, scale: ArrayLike = 1.0) -> list[Mesh]:
     Raises:
         InputError: the file cannot be read.
     """
+    import trimesh
+
     if path.stat().st_size > _MOST_BYTES:
         size = f"has {path.stat().st_size >> 20} MB."
         raise InputError(size, field=path.name, hint=f"simplify the mesh to {_MOST_BYTES >> 20} MB or less")
@@ -133,6 +138,8 @@ def as_shapes(vertices: Array, faces: NDArray[np.int64], link: int) -> list[Mesh
         faces: (T, 3) rows of the vertices.
         link: index of the link.
     """
+    import trimesh
+
     mesh = trimesh.Trimesh(vertices, faces, process=True)
     mesh.merge_vertices(merge_tex=True, merge_norm=True)
     if _is_closed(mesh):

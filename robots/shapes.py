@@ -5,14 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
-import open3d as o3d
 from numpy.typing import NDArray
 
 from splatbot.geometry import inverse, transform_points
 from splatbot.protocols import Array
+
+if TYPE_CHECKING:
+    import open3d as o3d
 
 _AROUND = 24  # corners of the rings of a capsule's mesh
 
@@ -154,6 +156,8 @@ class Mesh:
 
     @cached_property
     def _scene(self) -> o3d.t.geometry.RaycastingScene:
+        import open3d as o3d
+
         scene = o3d.t.geometry.RaycastingScene()
         vertices, faces = self.vertices.astype(np.float32), self.faces.astype(np.uint32)
         scene.add_triangles(o3d.core.Tensor.from_numpy(vertices), o3d.core.Tensor.from_numpy(faces))
@@ -165,6 +169,8 @@ class Mesh:
 
     def depth(self, points: Array) -> Array:
         """Compute the depth (P,) [m] of points (P, 3) [m, link frame] below the surface; negative outside."""
+        import open3d as o3d
+
         queries = o3d.core.Tensor.from_numpy(np.ascontiguousarray(points, dtype=np.float32))
         if not self.closed:
             return np.asarray(-self._scene.compute_distance(queries).numpy(), dtype=np.float64)

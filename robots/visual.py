@@ -6,15 +6,18 @@ import zipfile
 import zlib
 from collections.abc import Iterable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import open3d as o3d
 from numpy.typing import NDArray
 
 from splatbot.atomic import atomic_write
 from splatbot.errors import FormatError
 from splatbot.protocols import Array
 from splatbot.robots.shapes import Mesh, Shape
+
+if TYPE_CHECKING:
+    import open3d as o3d
 
 STEP = 1e-5
 """Resolution of stored corners [m]."""
@@ -31,6 +34,8 @@ def simplify(vertices: Array, faces: NDArray[np.integer], most: int) -> o3d.geom
         faces: (T, 3) rows of vertices.
         most: triangles of the result, at most.
     """
+    import open3d as o3d
+
     mesh = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(vertices), o3d.utility.Vector3iVector(faces))
     mesh = mesh.merge_close_vertices(STEP).remove_degenerate_triangles()
     if len(mesh.triangles) > most:

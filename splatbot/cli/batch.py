@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 _OF_LOGS = ("map", "sim2real")  # commands whose input is a log
 _OF_PATHS = ("train", "export")  # commands whose input is a path
+_NEED_INPUT = ("map", "simulate", "pick", *_OF_PATHS)
 
 
 def batch(
@@ -124,8 +125,8 @@ def _check(
 ) -> None:
     """Refuse wrong words before the libraries load."""
     check_output(out)
-    if not inputs and not options:
-        raise InputError("is missing.", field="INPUT", hint=f"name inputs, as in: splatbot batch {command} LOG LOG")
+    if not inputs and (command in _NEED_INPUT or not options):
+        raise InputError("is missing.", field="INPUT", hint=f"name inputs, as in: splatbot batch {command} INPUT INPUT")
     for option in options:
         if not option or option[0] == "out":
             hint = "write --with OPTION [VALUE ...]; each item has its own --out"
@@ -140,7 +141,7 @@ def _check(
 def _check_items(command: str, inputs: Sequence[str], items: Sequence[BatchItem]) -> None:
     """Refuse inputs that do not exist, and options that the command does not know, before an item runs."""
     combinations = len(items) // max(len(inputs), 1)
-    for item in items[:: combinations if inputs else len(items)]:
+    for item in items[::combinations] if inputs else ():
         _check_input(command, item.words[1])
     for item in items[:combinations]:
         _check_options(item.words)
@@ -150,9 +151,18 @@ def _check_input(command: str, text: str) -> None:
     if command in _OF_LOGS:
         if is_camera(text):
             raise InputError("is a camera.", field=text, hint="name recordings; splatbot map records and maps a camera")
-        log_kind(text)
+        if log_kind(text) == "synthetic":
+            _check_scene(text)
+    elif command == "simulate":
+        _check_scene(f"synthetic:{text}")
     elif command in _OF_PATHS and not Path(text).exists():
         raise InputError("does not exist.", file=text, field="INPUT", hint="check the path")
+
+
+def _check_scene(uri: str) -> None:
+    from splatbot.logs.synthetic import SyntheticLog
+
+    SyntheticLog(uri)  # refuses an unknown scene; no frame is rendered
 
 
 def _check_options(words: Sequence[str]) -> None:

@@ -132,16 +132,18 @@ def calibrate_hand_eye_command(
         out: scene.yaml to write; the fields of an existing one that this command estimates are replaced.
         quiet: no progress and no table, only errors.
     """
+    from splatbot.cli.placing import named_robot
+
+    arm = None if robot is None else named_robot(robot)
+
     from splatbot.calibration.hand_eye import calibrate_hand_eye
     from splatbot.cli.paths import check_output
     from splatbot.cli.progress import steps
     from splatbot.errors import InputError
-    from splatbot.robots.store import load_robot
     from splatbot.workspace import Workspace
 
     check_output(out, folder=False)
     scene = Workspace.load(out) if out is not None and out.exists() else Workspace()
-    arm = None if robot is None else load_robot(robot)
     names = scene.joint_names or (() if arm is None else tuple(arm.chain.names))
     if arm is not None and link is not None and abs(link) > len(arm.chain):
         raise InputError(f"is {link}.", field="--link", hint=f"{robot} has links 1..{len(arm.chain)} that move")

@@ -38,6 +38,10 @@ def calibrate_joint_delay_command(
     """
     from dataclasses import replace
 
+    from splatbot.cli.placing import named_robot
+
+    arm = named_robot(robot)
+
     from splatbot.cli.calibrate import describe
     from splatbot.cli.paths import check_camera, check_file, check_output
     from splatbot.cli.progress import shares
@@ -45,14 +49,13 @@ def calibrate_joint_delay_command(
     from splatbot.errors import InputError
     from splatbot.logs import open_log
     from splatbot.robots.joint_delay import estimate_joint_delay
-    from splatbot.robots.store import load_robot
     from splatbot.workspace import Workspace, find_workspace
 
     check_camera(camera)
     check_file(scene, "--scene")
     check_output(out, folder=False)
     workspace = Workspace.load(scene) if scene is not None else find_workspace(log) or Workspace()
-    arm, recording = load_robot(robot), open_log(log, camera=camera)
+    recording = open_log(log, camera=camera)
     with shares(quiet) as show:
         found = estimate_joint_delay(recording, arm, workspace, on_share=lambda share: show("delay", share))
     if not quiet:

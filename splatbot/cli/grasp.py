@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from splatbot.cli.paths import check_file, check_output
-from splatbot.cli.placing import Pose, agree_with_plans, base_pose, margin_value, run_folder
+from splatbot.cli.placing import Pose, agree_with_plans, base_pose, margin_value, named_robot, run_folder
 from splatbot.errors import InputError, SplatbotError
 from splatbot.layouts import map_file
 
@@ -114,6 +114,7 @@ def grasp(
     if len(index) != max(len(mask), 1):
         raise InputError(f"are {len(index)} for {max(len(mask), 1)}.", field="--index", hint="give one for each mask")
     check_output(out)
+    named = named_robot(robot)
 
     from splatbot.atomic import atomic_write
     from splatbot.cli.affordances import name_backends
@@ -129,7 +130,6 @@ def grasp(
     from splatbot.report.grasp_view import grasp_png
     from splatbot.robots.appearance import appearance
     from splatbot.robots.joint_offsets import robot_in_scene
-    from splatbot.robots.store import load_robot
     from splatbot.workspace import find_workspace
 
     options = GraspOptions(
@@ -142,7 +142,7 @@ def grasp(
         accept_implied=accept_implied,
         seed=seed,
     )
-    arm = robot_in_scene(load_robot(robot), find_workspace(map))
+    arm = robot_in_scene(named, find_workspace(map))
     with steps() as tell:
         tell("segmenting the objects of the map")
         objects = graspable_objects(map, base)

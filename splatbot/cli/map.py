@@ -14,6 +14,7 @@ from splatbot.cli.cameras import is_live, open_recorded, refuse_with_camera
 from splatbot.cli.doubts import camera_doubts, run_doubts
 from splatbot.cli.messages import print_message
 from splatbot.cli.paths import check_camera, check_file, check_output, check_state
+from splatbot.cli.placing import named_robot
 from splatbot.errors import InputError
 from splatbot.layouts import MAP_NAME, RECORDING, is_camera, log_kind
 
@@ -107,6 +108,8 @@ def map_log_command(
             raise InputError("is for cameras.", field="--seconds", hint="give --max-frames")
         _check(log, out, resume, localise, max_frames=max_frames, overwrite=overwrite)
         check_camera(camera)
+        if robot is not None:
+            named_robot(robot)
 
     from splatbot.config import load_config
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from splatbot.cli.paths import check_output
-from splatbot.cli.placing import Pose
+from splatbot.cli.placing import Pose, named_robot
 from splatbot.cli.tables import print_columns, print_table, print_text
 from splatbot.layouts import map_file
 
@@ -47,14 +47,13 @@ def objects(
     file = map_file(map)
     picture = out if out is not None else file.with_name("objects.png")
     check_output(picture, folder=False)
+    arm = named_robot(robot)
 
     from splatbot.atomic import atomic_write
     from splatbot.cli.grasp import graspable_objects
     from splatbot.grasping.object_list import list_objects, list_planes, stroke_of
     from splatbot.report.objects_view import objects_png
-    from splatbot.robots.store import load_robot
 
-    arm = load_robot(robot)
     scene = graspable_objects(map, base).scene
     found, planes = list_objects(scene, arm), list_planes(scene)
     with atomic_write(picture) as handle:

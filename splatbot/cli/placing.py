@@ -37,6 +37,18 @@ def checked_pose(pose: Pose, flag: str) -> NDArray[np.float64]:
         raise InputError(f"{error}.", field=flag, hint="QW QX QY QZ of no rotation are 1 0 0 0") from error
 
 
+def named_robot(name: str) -> RobotModel:
+    """Return a robot by name; commands call it before their libraries load, so that a wrong name fails at once.
+
+    Raises:
+        InputError: no robot has that name.
+        FormatError: the file of the robot is damaged.
+    """
+    from splatbot.robots.store import load_robot
+
+    return load_robot(name)
+
+
 def base_pose(pose: Pose | None, map_: Path) -> NDArray[np.float64]:
     """Return T_world_base (4, 4): the given one, or that of the scene.yaml next to the map.
 
@@ -144,10 +156,22 @@ def joint_values(words: tuple[str, ...], robot: RobotModel, flag: str) -> NDArra
     Raises:
         InputError: they are no numbers, too few or too many, or degrees.
     """
+    from splatbot.planning.goals import suspect_degrees
+
+    values = joint_numbers(words, robot, flag)
+    suspect_degrees(values, robot.chain, flag)
+    return values
+
+
+def joint_numbers(words: tuple[str, ...], robot: RobotModel, flag: str) -> NDArray[np.float64]:
+    """Parse joint values (J,) [rad or m], or "home", without the libraries that recognize degrees.
+
+    Raises:
+        InputError: they are no numbers, or too few or too many.
+    """
     import numpy as np
 
     from splatbot.errors import InputError
-    from splatbot.planning.goals import suspect_degrees
 
     if words == ("home",):
         return np.asarray(robot.home)
@@ -157,7 +181,6 @@ def joint_values(words: tuple[str, ...], robot: RobotModel, flag: str) -> NDArra
         raise InputError(f"is {' '.join(words)}.", field=flag, hint='give numbers, or "home"') from error
     if len(values) != len(robot) or not np.isfinite(values).all():
         raise InputError(f"has {len(values)} values.", field=flag, hint=f"{robot.name} has {len(robot)} joints")
-    suspect_degrees(values, robot.chain, flag)
     return values
 
 

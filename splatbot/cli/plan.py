@@ -15,9 +15,11 @@ from splatbot.cli.placing import (
     base_pose,
     base_words,
     checked_pose,
+    joint_numbers,
     joint_values,
     map_obstacles,
     margin_value,
+    named_robot,
     pose_values,
     run_folder,
 )
@@ -106,6 +108,9 @@ def plan(
     file = map_file(map)
     check_file(grasp, "--grasp")
     check_output(out)
+    named = named_robot(robot)
+    for words, flag in ((start, "--start"), (goal or ("home",), "--goal")):
+        joint_numbers(words, named, flag)
 
     import numpy as np
 
@@ -120,10 +125,9 @@ def plan(
     from splatbot.report.plan_page import plan_html, plan_png
     from splatbot.robots.appearance import appearance, coarse_appearance
     from splatbot.robots.joint_offsets import robot_in_scene
-    from splatbot.robots.store import load_robot
     from splatbot.workspace import find_workspace
 
-    arm = robot_in_scene(load_robot(robot), find_workspace(map))
+    arm = robot_in_scene(named, find_workspace(map))
     model = GaussianModel.load(file)
     T_world_base = base_pose(base, map)
     here = joint_values(start, arm, "--start")

@@ -199,21 +199,22 @@ def _add(
     from splatbot.cli.tables import print_text
     from splatbot.errors import InputError
     from splatbot.robots.arms import ARMS
+    from splatbot.robots.hands import Hand, attach, find_hand
+
+    of_file = gripper is not None and Path(gripper).suffix in (".urdf", ".xacro")
+    hand: Hand | None = None if gripper is None or of_file else find_hand(gripper)
+
     from splatbot.robots.containment import uncovered
     from splatbot.robots.description import read_description, visual_of
     from splatbot.robots.hand_reader import read_hand
-    from splatbot.robots.hands import Hand, attach, find_hand
     from splatbot.robots.reading import simplified
     from splatbot.robots.store import load_robot, robot_file, save_robot
     from splatbot.robots.visual import visual_meshes
 
-    hand: Hand | None = None
     notes: tuple[str, ...] = ()
-    if gripper is not None and Path(gripper).suffix in (".urdf", ".xacro"):
+    if gripper is not None and of_file:
         read = read_hand(gripper)
         hand, notes = read.hand, read.notes
-    elif gripper is not None:
-        hand = find_hand(gripper)
     stored = str(path) in ARMS and not path.exists()
     if stored and hand is None:
         raise InputError("is shipped.", field=str(path), hint="attach a hand with --gripper, or give a file")

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from splatbot.cli.paths import check_camera, check_file, check_output
+from splatbot.cli.placing import named_robot
 from splatbot.errors import InputError
 from splatbot.layouts import REPLAY, is_camera, log_kind, map_file
 
@@ -97,6 +98,8 @@ def serve(
     check_file(scene, "--scene")
     check_output(data, "--data")
     check_output(record, "--record", folder=False)
+    if robot is not None:
+        named_robot(robot)
 
     from splatbot.config import load_config
     from splatbot.services.requests import configure_logging

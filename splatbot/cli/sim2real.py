@@ -9,11 +9,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from splatbot.cli.paths import check_output, check_run
+from splatbot.cli.placing import named_robot
 from splatbot.errors import InputError
 from splatbot.layouts import log_kind
 
 if TYPE_CHECKING:
     from splatbot.bench.sim2sim import SimToSimPlan
+    from splatbot.robots.robot import RobotModel
 
 Tell = Callable[[str, float], None]
 
@@ -70,6 +72,7 @@ def sim2real(
     if log is not None and map is not None:
         log_kind(log)
         check_run(map)
+    arm = named_robot(robot)
     check_output(out)
     check_output(json, "--json", folder=False)
 
@@ -79,7 +82,7 @@ def sim2real(
     interrupted = False
     with shares(quiet) as tell:
         if log is not None and map is not None:
-            interrupted = _compare_log(log, map, robot, frames, folder, json, tell, quiet)
+            interrupted = _compare_log(log, map, arm, frames, folder, json, tell, quiet)
             json = None
         if held_out and not interrupted:
             plan = _plan(task, tables, trials, seed, quick)
@@ -90,18 +93,17 @@ def sim2real(
 
 
 def _compare_log(
-    log: str, map: Path, robot: str, frames: int, folder: Path, json: Path | None, tell: Tell, quiet: bool
+    log: str, map: Path, robot: RobotModel, frames: int, folder: Path, json: Path | None, tell: Tell, quiet: bool
 ) -> bool:
     """Compare, and return whether it was interrupted."""
     from splatbot.cli.tables import print_table
     from splatbot.results.folder import RunFolder
     from splatbot.robots.in_view import reopen_log
-    from splatbot.robots.store import load_robot
     from splatbot.sim.compare.log_twin import KIND, compare_log
     from splatbot.sim.compare.page import log_html, log_rows
 
     run = RunFolder(map)
-    found = compare_log(reopen_log(run, uri=log), run, load_robot(robot), frames=frames, on_progress=tell)
+    found = compare_log(reopen_log(run, uri=log), run, robot, frames=frames, on_progress=tell)
     _write(folder, "sim2real", json, found.to_dict(), log_html(found))
     if not quiet:
         print_table(log_rows(found), title=f"{KIND}: {found.log} against the twin of {found.map}")

@@ -12,7 +12,7 @@ import tyro
 
 from splatbot.cli.drawing import CAMERA, draw_offscreen, film
 from splatbot.cli.paths import check_file, check_output
-from splatbot.cli.placing import Pose, checked_pose
+from splatbot.cli.placing import Pose, checked_pose, named_robot
 from splatbot.errors import FormatError, InputError
 from splatbot.layouts import map_file
 
@@ -88,9 +88,9 @@ def twin(
     check_file(trajectory, "--trajectory")
     for flag, path in (("--json", json), ("--video", video), ("--html", html)):
         check_output(path, flag, folder=False)
+    arm = None if robot is None else named_robot(robot)
 
     from splatbot.robots.joint_offsets import robot_in_scene
-    from splatbot.robots.store import load_robot
     from splatbot.sim.ledger import ledger
     from splatbot.sim.motion import load_motion
     from splatbot.sim.recording import TwinRecording
@@ -98,9 +98,8 @@ def twin(
     from splatbot.workspace import find_workspace
 
     chosen = _scene(scene, map, base, with_camera=video is not None).with_effects(force=force, forbid=forbid)
-    arm = None if robot is None else load_robot(robot)
     if map is not None and chosen.robot is not None:
-        arm = robot_in_scene(arm or load_robot(chosen.robot.model), find_workspace(map))
+        arm = robot_in_scene(arm or named_robot(chosen.robot.model), find_workspace(map))
     it = Twin(chosen, robot=arm, timestep=timestep, seed=seed)
     motion = None
     if trajectory is not None and it.world.robot is not None:

@@ -10,6 +10,7 @@ from typing import Annotated
 import tyro
 
 from splatbot.cli.paths import check_output
+from splatbot.cli.placing import named_robot
 from splatbot.layouts import map_file
 
 
@@ -38,6 +39,7 @@ def view(
     """
     file = map_file(map)
     check_output(html, "--html", folder=False)
+    named_robot(robot)
 
     from splatbot.atomic import atomic_write
     from splatbot.gaussians import GaussianModel, Snapshot

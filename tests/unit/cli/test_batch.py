@@ -22,6 +22,9 @@ LOG = "synthetic:tabletop?frames=10&width=160&height=120"
     ("words", "problem"),
     [
         (["map"], "INPUT: is missing"),
+        (["simulate", "--with", "frames", "2"], "INPUT: is missing"),
+        (["simulate", "tabletop", "tabletopx"], "there is no scene 'tabletopx'"),
+        (["map", LOG, "synthetic:tabletopx"], "there is no scene 'tabletopx'"),
         (["map", LOG, "/nowhere/log"], "/nowhere/log: log: does not exist"),
         (["map", "oak://"], "oak://: is a camera"),
         (["train", "/nowhere/photographs"], "/nowhere/photographs: INPUT: does not exist"),
@@ -64,21 +67,21 @@ def test_ray_that_is_not_installed_is_named(run: RunCommand, tmp_path: Path, mon
 def test_the_report_has_a_row_for_each_item_of_the_folder(run: RunCommand, tmp_path: Path) -> None:
     size = ("--with", "frames", "2", "--with", "size", "64x48")
     assert run("batch", "simulate", "tabletop", "--out", tmp_path, *size).code == 0
-    answer = run("batch", "simulate", "wall", "shelf", "--out", tmp_path, *size)
+    answer = run("batch", "simulate", "wall", "corridor", "--out", tmp_path, *size, "--with", "trajectory", "orbit")
     assert answer.code == 1
     assert "wall: finished" in answer.err
-    assert "no scene 'shelf'" in answer.err
+    assert "'orbit' does not fit" in answer.err
     rows = json.loads((tmp_path / "batch.json").read_text())["items"]
     assert [(row["name"], row["state"]) for row in rows] == [
         ("wall", "finished"),
-        ("shelf", "failed"),
+        ("corridor", "failed"),
         ("tabletop", "finished"),
     ]
     with (tmp_path / "batch.csv").open(newline="") as file:
         assert [(row["name"], row["error"]) for row in csv.DictReader(file)] == [
             (row["name"], row["error"]) for row in rows
         ]
-    for text in ("tabletop", "no scene 'shelf'", "batch.json"):
+    for text in ("tabletop", "'orbit' does not fit", "batch.json"):
         assert text in answer.out
 
 

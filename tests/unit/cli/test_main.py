@@ -44,6 +44,42 @@ def test_help_imports_nothing_heavy(words: list[str]) -> None:
     assert answer.stdout.splitlines()[-1] == "HEAVY []"
 
 
+_ROBOT_WORDS = {
+    "there is no robot 'pnda'": [
+        ["objects", "{map}", "--robot", "pnda"],
+        ["grasp", "--map", "{map}", "--target", "cup", "--robot", "pnda"],
+        ["plan", "--map", "{map}", "--start", "home", "--goal", "home", "--robot", "pnda"],
+        ["twin", "--map", "{map}", "--robot", "pnda"],
+        ["view", "{map}", "--robot", "pnda"],
+        ["serve", "--map", "{map}", "--robot", "pnda"],
+        ["map", "synthetic:tabletop", "--robot", "pnda"],
+        ["calibrate", "joint-delay", "synthetic:tabletop", "--robot", "pnda"],
+        ["calibrate", "hand-eye", "{map}", "--robot", "pnda"],
+        ["robot", "mjcf", "pnda"],
+    ],
+    "ur5e has 6 joints": [["plan", "--map", "{map}", "--start", "home", "--goal", "1", "2", "3", "--robot", "ur5e"]],
+    "--start: is 1 high": [["plan", "--map", "{map}", "--start", "1", "high", "--goal", "home"]],
+    "gripper: is '3f'": [["robot", "add", "ur5e", "--gripper", "3f"]],
+}
+
+
+@pytest.mark.parametrize(("problem", "words"), [(p, each) for p, lists in _ROBOT_WORDS.items() for each in lists])
+def test_a_wrong_robot_joint_count_or_gripper_is_named_before_libraries_load(
+    tmp_path: Path, problem: str, words: list[str]
+) -> None:
+    (tmp_path / "map.ply").touch()
+    program = (
+        "import sys\nfrom splatbot.cli import main\n"
+        f"code = main({[word.format(map=tmp_path / 'map.ply') for word in words]!r})\n"
+        "print('HEAVY', [m for m in ('torch', 'open3d', 'cv2', 'mujoco', 'fastapi', 'scipy') if m in sys.modules])\n"
+        "sys.exit(code)"
+    )
+    answer = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=120)
+    assert answer.returncode == 2
+    assert problem in answer.stderr
+    assert answer.stdout.splitlines()[-1] == "HEAVY []"
+
+
 def test_the_help_lists_every_command(run: RunCommand) -> None:
     for group, members in (((), COMMANDS), (("bench",), BENCHMARKS)):
         answer = run(*group, "--help")
