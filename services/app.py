@@ -31,14 +31,17 @@ from splatbot.services.routes import (
     jobs,
     landing,
     maps,
+    merging,
     objects,
     picks,
     plans,
+    quota,
     render,
     robots,
     ros,
     trajectories,
     trials,
+    versions,
     views,
 )
 from splatbot.services.runtime import Runtime
@@ -106,6 +109,8 @@ def create_app(runtime: Runtime) -> FastAPI:
         health,
         maps,
         frames,
+        versions,
+        merging,
         distance,
         collisions,
         render,
@@ -119,6 +124,7 @@ def create_app(runtime: Runtime) -> FastAPI:
         trajectories,
         trials,
         jobs,
+        quota,
         ros,
     ):
         app.include_router(group.router)

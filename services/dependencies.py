@@ -32,6 +32,11 @@ async def _settings(request: Request) -> ServiceSettings:
     return (await _runtime(request)).settings
 
 
+async def _caller(request: Request) -> str:
+    caller: str = request.state.client
+    return caller
+
+
 async def _served_map(
     request: Request,
     store: Annotated[MapStore, Depends(_store)],
@@ -54,6 +59,8 @@ async def _map_after_frames(
 Service = Annotated[Runtime, Depends(_runtime)]
 Store = Annotated[MapStore, Depends(_store)]
 Settings = Annotated[ServiceSettings, Depends(_settings)]
+Caller = Annotated[str, Depends(_caller)]
+"""Name of the client, whose quota new maps, versions and jobs count in."""
 Served = Annotated[ServedMap, Depends(_served_map)]
 ServedAfterFrames = Annotated[ServedMap, Depends(_map_after_frames)]
 """The same for expensive requests: frames that are being mapped have priority."""
@@ -62,11 +69,13 @@ ServedAfterFrames = Annotated[ServedMap, Depends(_map_after_frames)]
 def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
     """Return OpenAPI entries of the problem documents that a route may answer with."""
     what = {
+        403: "the key lacks the scope, or the client's quota of maps or bytes is used up",
         404: "nothing of that name",
         409: "conflicts with the present state: the name is taken, the arm moves, the key was used",
         413: "more than one request may ask",
         415: "the body is of a kind that is not taken",
         422: "the request makes no sense; `detail` names the field and `hint` the fix",
+        429: "too many requests, or jobs of this client; try again after Retry-After seconds",
         507: "the disk is full",
         503: "not ready; try again after Retry-After seconds",
     }

@@ -67,6 +67,11 @@ class MapHistory:
         self._disk, self._mapping_of = disk, mapping_of
 
     @property
+    def is_on(self) -> bool:
+        """True if the service keeps versions."""
+        return self._versions is not None
+
+    @property
     def versions(self) -> Versions:
         """The saved versions.
 

@@ -104,7 +104,7 @@ class _Present(Collector):
         maps = self._store.list()
         families = {
             "gaussians": ("Gaussians in the map", lambda m: len(m.snapshot.model) if m.snapshot else 0),
-            "bytes": ("Size of the map", lambda m: m.snapshot.model.nbytes if m.snapshot else 0),
+            "bytes": ("Size of the map", lambda m: m.nbytes),
             "version": ("Published states", lambda m: m.map_version),
         }
         for name, (help_text, value) in families.items():

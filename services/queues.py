@@ -27,6 +27,7 @@ AT_ONCE = {
     "queries": max(2, _SHARE),
     "frames": 8,
     "uploads": 4,
+    "versions": 2,
     "others": 4,
 }
 """Requests of each kind that are worked on at once. More than the cores would only slow down mapping."""
@@ -42,6 +43,7 @@ _KINDS = {
     "queries": re.compile(r".*/(distance|collisions)"),
     "frames": re.compile(r".*/frames"),
     "uploads": re.compile(r".*/upload"),
+    "versions": re.compile(r".*/versions(/.*)?"),
 }
 
 

@@ -387,6 +387,13 @@ class Runtime:
             self.jobs.end(job_id, timeout)
         self._end(served.generation, "the map was deleted", timeout)
 
+    def withdraw(self, served: ServedMap) -> None:
+        """Remove a map whose making has failed; the job that makes it calls this."""
+        with self._lock:
+            self._jobs_of.pop(served.generation, None)
+        with suppress(MapNotFoundError):  # deleted meanwhile
+            self.remove(served)
+
     def save(self, served: ServedMap) -> None:
         """Keep the map's present state on disk if there is a folder for it and the map is not deleted.
 

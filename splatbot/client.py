@@ -182,6 +182,51 @@ class Client(AbstractContextManager["Client"]):
         """Delete a map."""
         self.request("DELETE", _map_path(map_id))
 
+    def save_version(self, map_id: str, label: str | None = None, *, note: str | None = None) -> dict[str, Any]:
+        """Save a map as it is now, and return the version: number, label, gaussians, keyframes, bytes, checksum, ..."""
+        return self._json("POST", _map_path(map_id, "versions"), {"label": label, "note": note})
+
+    def versions(self, map_id: str) -> list[dict[str, Any]]:
+        """List the versions of a map by number."""
+        found: list[dict[str, Any]] = self._json("GET", _map_path(map_id, "versions"))["versions"]
+        return found
+
+    def restore(self, map_id: str, number: int) -> dict[str, Any]:
+        """Let a map go back to a version, and return the new version that records it."""
+        return self._json("POST", _map_path(map_id, "versions", str(number), "restore"))
+
+    def delete_version(self, map_id: str, number: int) -> None:
+        """Delete a version of a map."""
+        self.request("DELETE", _map_path(map_id, "versions", str(number)))
+
+    def merge(self, map_id: str, other: str, made: str, *, key: str | None = None, **more: int) -> dict[str, Any]:
+        """Merge two maps into a new one, and return the job.
+
+        Args:
+            map_id: name of the map whose world the new one has.
+            other: name of the later map.
+            made: name of the new map.
+            key: Idempotency-Key; a repeated request with the same key returns the same job.
+            more: version, other_version: numbers of versions instead of the present states.
+        """
+        body = {"id": made, "other": other, **more}
+        return self._json("POST", _map_path(map_id, "merge"), body, _idempotency(key))
+
+    def diff(self, map_id: str, other: str, *, key: str | None = None, **more: int | bool) -> dict[str, Any]:
+        """Find the objects that differ between a map and a later one, and return the job; its result has ``objects``.
+
+        Args:
+            map_id: name of the earlier map.
+            other: name of the later map; the same name with ``version`` compares a map with its earlier state.
+            key: Idempotency-Key; a repeated request with the same key returns the same job.
+            more: version, other_version: numbers of versions instead of the present states; aligned.
+        """
+        return self._json("POST", _map_path(map_id, "diff"), {"other": other, **more}, _idempotency(key))
+
+    def quota(self) -> dict[str, Any]:
+        """Return used and largest numbers of maps, jobs and bytes of this client."""
+        return self._json("GET", "/v1/quota")
+
     def push(self, map_id: str, frame: Frame) -> TrackedFrame:
         """Send a frame of any camera for tracking and mapping; wait while too many frames are in progress."""
         c = frame.camera

@@ -101,7 +101,7 @@ _Body = Annotated[FrameRequest, Depends(body_of(FrameRequest))]
 @router.post(
     "/{map_id}/frames",
     response_class=Response,
-    responses=answers(_ANSWER) | problems(404, 409, 413, 415, 422, 503),
+    responses=answers(_ANSWER) | problems(403, 404, 409, 413, 415, 422, 503),
     openapi_extra=request_body(FrameRequest, {"a small frame of the first camera": _example()}),
 )
 def push_frame(request: Request, served: Served, service: Service, query: _Body) -> Response:
@@ -112,6 +112,7 @@ def push_frame(request: Request, served: Served, service: Service, query: _Body)
     time between that camera's frames, newer. Otherwise it is refused (409).
     """
     frames = service.stream(served.id)
+    service.quotas.check_bytes(served.owner)
     frames.check_camera(query.camera_name)  # before its images are decoded
     pushed = frames.push(_frame(query, service.settings.max_pixels))
     try:

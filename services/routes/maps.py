@@ -24,6 +24,7 @@ from splatbot.protocols import Array
 from splatbot.services.arms import known_robot
 from splatbot.services.codecs import ZIP, answer, answers, body_of, request_body
 from splatbot.services.dependencies import (
+    Caller,
     IdempotencyKey,
     Served,
     Service,
@@ -117,18 +118,20 @@ def list_maps(store: Store) -> MapList:
     status_code=202,
     responses=starts("a job maps the recording")
     | {201: {"description": "an empty map, to which frames can be pushed", "model": MapInfo}}
-    | problems(409, 415, 422, 503),
+    | problems(403, 409, 415, 422, 429, 503),
     openapi_extra=request_body(MapRequest, _CREATE),
 )
 def create_map(
-    query: Annotated[MapRequest, Depends(body_of(MapRequest))], service: Service, key: IdempotencyKey
+    query: Annotated[MapRequest, Depends(body_of(MapRequest))], service: Service, key: IdempotencyKey, caller: Caller
 ) -> Response:
     """Make a map of a recording, by a job; or, without `log`, an empty one for frames that will be pushed."""
     check_id(query.id)
     base = query.robot_base.matrix("robot_base") if query.robot_base is not None else None
     if query.log is None:
+        service.quotas.check_bytes(caller)
         mask, config = _mask_of_stream(service, query), _with_cameras(service.config, query)
-        served = service.open_stream(query.id, workspace=_scene(query, "synthetic:", base), mask=mask, config=config)
+        workspace = _scene(query, "synthetic:", base)
+        served = service.open_stream(query.id, workspace=workspace, mask=mask, config=config, owner=caller)
         place = {"Location": f"/v1/maps/{query.id}"}
         return Response(_info(served).model_dump_json(), 201, place, media_type="application/json")
     if query.cameras:
@@ -137,6 +140,7 @@ def create_map(
     known = service.jobs.known(key, request)
     if known is not None:
         return accepted(known)
+    service.quotas.check_bytes(caller)
     limits = service.settings
     uri = allowed_log(
         query.log, limits.log_roots, camera=query.camera, max_frames=limits.max_frames, max_pixels=limits.max_pixels
@@ -145,7 +149,7 @@ def create_map(
     total = check_length(log, limits.max_frames, query.max_frames)
     workspace = _scene(query, uri, base)
     served = service.store.add(
-        query.id, source=log.name, state="mapping", workspace=workspace, mask=mask, awaited=False
+        query.id, source=log.name, state="mapping", workspace=workspace, mask=mask, awaited=False, owner=caller
     )
     try:
         work = map_recording(service, served, log, total)
@@ -160,7 +164,7 @@ def create_map(
 @router.post(
     "/{map_id}/upload",
     status_code=202,
-    responses=starts("a job unpacks and maps the recording") | problems(409, 413, 415, 422, 503),
+    responses=starts("a job unpacks and maps the recording") | problems(403, 409, 413, 415, 422, 429, 503),
     openapi_extra={
         "requestBody": {
             "required": True,
@@ -172,6 +176,7 @@ async def upload_map(
     request: Request,
     service: Service,
     key: IdempotencyKey,
+    caller: Caller,
     map_id: Annotated[str, Path(description="of the map to be made", examples=["desk"])],
 ) -> Response:
     """Make a map of a recording that is sent as a zip of a folder in TUM layout; a job unpacks and maps it."""
@@ -182,7 +187,8 @@ async def upload_map(
         digest = await _receive(request, FilePath(os.devnull), service.settings.max_upload_bytes)
         if (known := service.jobs.known(key, f"upload {map_id} {digest}")) is not None:
             return accepted(known)
-    served = service.store.add(map_id, source="an upload", state="mapping", awaited=False)
+    service.quotas.check_bytes(caller)
+    served = service.store.add(map_id, source="an upload", state="mapping", awaited=False, owner=caller)
     scratch = None
     try:
         scratch = Scratch("upload")
@@ -300,7 +306,7 @@ def _info(served: ServedMap) -> MapInfo:
         detail=served.detail,
         source=served.source,
         gaussians=len(snapshot.model) if snapshot else 0,
-        bytes=snapshot.model.nbytes if snapshot else 0,
+        bytes=served.nbytes,
         sh_degree=snapshot.model.sh_degree if snapshot else 0,
         stamp=snapshot.stamp if snapshot else 0.0,
         bounds=bounds,

@@ -11,7 +11,7 @@ from splatbot.grasping.language import LanguageAffordance
 from splatbot.grasping.options import GraspOptions
 from splatbot.grasping.pick_types import PickOptions, PickStage, PickStep
 from splatbot.services.codecs import body_of, plain, request_body
-from splatbot.services.dependencies import IdempotencyKey, Service, problems
+from splatbot.services.dependencies import Caller, IdempotencyKey, Service, problems
 from splatbot.services.jobs import JobCancelled, JobHandle
 from splatbot.services.problems import TooLargeError
 from splatbot.services.routes.jobs import accepted, starts
@@ -31,11 +31,14 @@ _STAGES = list(PickStage)
     "",
     status_code=202,
     responses=starts("a job picks it; its result holds the outcome, each stage, and the lift of each object")
-    | problems(404, 409, 413, 415, 422, 503),
+    | problems(404, 409, 413, 415, 422, 429, 503),
     openapi_extra=request_body(PicksRequest, _EXAMPLES),
 )
 def pick(
-    service: Service, query: Annotated[PicksRequest, Depends(body_of(PicksRequest))], key: IdempotencyKey
+    service: Service,
+    query: Annotated[PicksRequest, Depends(body_of(PicksRequest))],
+    key: IdempotencyKey,
+    caller: Caller,
 ) -> Response:
     """Pick an object in the physics of a scene: scan it, find grasps, plan, approach, close, lift, check.
 
@@ -59,7 +62,11 @@ def pick(
     )
     scene = load_scene(query.scene)
     job, _ = service.jobs.submit(
-        "pick", lambda handle: _pick(scene, query, options, handle), key=key, request=query.model_dump_json()
+        "pick",
+        lambda handle: _pick(scene, query, options, handle),
+        key=key,
+        request=query.model_dump_json(),
+        client=caller,
     )
     return accepted(job)
 

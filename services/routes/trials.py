@@ -11,7 +11,7 @@ from splatbot.errors import InputError
 from splatbot.planning import JointTrajectory
 from splatbot.robots.robot import RobotModel
 from splatbot.services.codecs import body_of, plain, request_body
-from splatbot.services.dependencies import IdempotencyKey, Service, problems
+from splatbot.services.dependencies import Caller, IdempotencyKey, Service, problems
 from splatbot.services.jobs import JobHandle
 from splatbot.services.robots_in_maps import base_in, robot_in
 from splatbot.services.routes.jobs import accepted, starts
@@ -26,7 +26,7 @@ router = APIRouter(prefix="/v1/sim", tags=["simulation"])
 @router.post(
     "/trials",
     status_code=202,
-    responses=starts("a job runs the trials; its result holds one entry for each") | problems(404, 415, 422, 503),
+    responses=starts("a job runs the trials; its result holds one entry for each") | problems(404, 415, 422, 429, 503),
     openapi_extra=request_body(
         TrialsRequest,
         {
@@ -36,7 +36,10 @@ router = APIRouter(prefix="/v1/sim", tags=["simulation"])
     ),
 )
 def trials(
-    service: Service, query: Annotated[TrialsRequest, Depends(body_of(TrialsRequest))], key: IdempotencyKey
+    service: Service,
+    query: Annotated[TrialsRequest, Depends(body_of(TrialsRequest))],
+    key: IdempotencyKey,
+    caller: Caller,
 ) -> Response:
     """Try a motion in a scene's physics: tracking error, contacts, dropped objects.
 
@@ -64,7 +67,8 @@ def trials(
             done = [_trial(scene, robot, trajectory, query, i, handle) for i in range(query.trials)]
         return {"scene": query.scene or ("empty" if query.map is None else None), "map": query.map, "trials": done}
 
-    return accepted(service.jobs.submit("trials", work, key=key, request=query.model_dump_json())[0])
+    job, _ = service.jobs.submit("trials", work, key=key, request=query.model_dump_json(), client=caller)
+    return accepted(job)
 
 
 def _shipped(name: str) -> Scene:

@@ -74,7 +74,11 @@ def compare_runs(
         FormatError: the state of a run is missing or damaged.
         InputError: a run has several cameras, or B is not found in A.
     """
-    a, b = load_run(run_a), load_run(run_b)
+    return compare_saved(load_run(run_a), load_run(run_b), aligned=aligned, on_share=on_share)
+
+
+def compare_saved(a: SavedRun, b: SavedRun, *, aligned: bool, on_share: Callable[[str, float], None]) -> RunComparison:
+    """Compare two loaded runs, see :func:`compare_runs`."""
     alignment = None
     if not aligned:
         report, otherwise = partial(on_share, "locating B in A"), "; or give --aligned if both have one world"

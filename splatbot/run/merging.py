@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -55,18 +55,23 @@ class MergedRun:
 
     def summary(self) -> dict[str, Any]:
         """Return the figures of the merge under the stable keys of ``merge.json``."""
-        return {
-            "T_a_b": pose_of(self.alignment),
-            "keyframes_tried": self.alignment.tried,
-            "keyframes_found": self.alignment.found,
-            "keyframes_agreeing": len(self.alignment.located),
-            "overlap": self.joined.overlap,
-            "gaussians_kept": self.joined.kept,
-            "gaussians_removed": self.joined.removed,
-            "gaussians_added": self.joined.added,
-            "gaussians_covered": self.joined.covered,
-            "time_offset_s": self.time_offset,
-        }
+        return merge_figures(self.alignment, self.joined, self.time_offset)
+
+
+def merge_figures(alignment: MapAlignment, joined: JoinedModel, time_offset: float) -> dict[str, Any]:
+    """Return the figures of a merge, for JSON."""
+    return {
+        "T_a_b": pose_of(alignment),
+        "keyframes_tried": alignment.tried,
+        "keyframes_found": alignment.found,
+        "keyframes_agreeing": len(alignment.located),
+        "overlap": joined.overlap,
+        "gaussians_kept": joined.kept,
+        "gaussians_removed": joined.removed,
+        "gaussians_added": joined.added,
+        "gaussians_covered": joined.covered,
+        "time_offset_s": time_offset,
+    }
 
 
 def pose_of(alignment: MapAlignment) -> dict[str, Any]:
@@ -191,7 +196,7 @@ def _merge_into(
     a, b, alignment = aligned.a, aligned.b, aligned.alignment
     time_offset = _write_recordings(folder.path / RECORDINGS, a, b)
     log = open_log(folder.path / RECORDINGS)
-    slam, joined = _merged_slam(a, b, alignment, first_index=a.place.frames, time_offset=time_offset)
+    slam, joined = merged_slam(a, b, alignment, first_index=a.place.frames, time_offset=time_offset)
     index, stamp = b.place.last_index, b.place.last_stamp
     place = replace(
         b.place,
@@ -237,13 +242,8 @@ def _check(a: SavedRun, b: SavedRun) -> None:
 
 
 def _write_recordings(file: Path, a: SavedRun, b: SavedRun) -> float:
-    """Write the list of the two recordings, and return the time [s] by which the stamps of B are later.
-
-    Stamps of B that follow those of A stay. Otherwise B begins one mean period after A.
-    """
-    stamps_a, stamps_b = (stamps_of(open_log(s.place.uri, camera=s.place.camera)) for s in (a, b))
-    period = (stamps_a[-1] - stamps_a[0]) / max(len(stamps_a) - 1, 1) or 1.0
-    offset = 0.0 if stamps_b[0] > stamps_a[-1] else round(stamps_a[-1] + period - stamps_b[0], 6)
+    """Write the list of the two recordings, and return the time [s] by which the stamps of B are later."""
+    offset = later_by(*(stamps_of(open_log(s.place.uri, camera=s.place.camera)) for s in (a, b)))
     entries: list[dict[str, Any]] = []
     for saved, own in ((a, 0.0), (b, offset)):
         camera = {} if saved.place.camera is None else {"camera": _absolute(saved.place.camera)}
@@ -252,14 +252,30 @@ def _write_recordings(file: Path, a: SavedRun, b: SavedRun) -> float:
     return offset
 
 
+def later_by(stamps_a: Sequence[float], stamps_b: Sequence[float]) -> float:
+    """Return the time [s] that is added to the stamps of B so that they follow those of A.
+
+    Stamps of B that follow those of A stay. Otherwise B begins one mean period after A.
+    """
+    period = (stamps_a[-1] - stamps_a[0]) / max(len(stamps_a) - 1, 1) or 1.0
+    return 0.0 if stamps_b[0] > stamps_a[-1] else round(stamps_a[-1] + period - stamps_b[0], 6)
+
+
 def _absolute(address: str) -> str:
     return str(Path(address).resolve()) if Path(address).exists() else address
 
 
-def _merged_slam(
+def merged_slam(
     a: SavedRun, b: SavedRun, alignment: MapAlignment, *, first_index: int, time_offset: float
 ) -> tuple[Slam, JoinedModel]:
-    """Return a SLAM with the frames, keyframes and Gaussians of both runs; those of B have later numbers."""
+    """Return a SLAM with the frames, keyframes and Gaussians of both runs; those of B have later numbers.
+
+    Args:
+        a, b: the runs; they do not change.
+        alignment: pose of B in A.
+        first_index: index of the first frame of B.
+        time_offset: time [s] that is added to the stamps of B.
+    """
     number = 1 + max(keyframe.number for keyframe in a.slam.keyframes)
     keyframes_b = [_moved_keyframe(keyframe, alignment.T_a_b, number) for keyframe in b.slam.keyframes]
     model_b = b.slam.snapshot().model
