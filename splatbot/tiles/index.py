@@ -94,7 +94,9 @@ def read_index(folder: Path) -> TileIndex:
     try:
         if file.stat().st_size > MAX_INDEX_BYTES:
             raise FormatError(f"has more than {MAX_INDEX_BYTES:,} bytes.", file=file, hint=_HINT)
-        body: Any = json.loads(file.read_bytes())
+        body = json.loads(file.read_bytes())
+        if not isinstance(body, dict):
+            raise ValueError("no object")
         given = body.pop("sha256", None)
         index = TileIndex.model_validate(body)
     except OSError as error:
@@ -104,7 +106,7 @@ def read_index(folder: Path) -> TileIndex:
         first = error.errors()[0]
         field = ".".join(str(part) for part in first["loc"])
         raise FormatError(f"is damaged: {first['msg']}.", file=file, field=field, hint=_HINT) from error
-    except (ValueError, AttributeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:
         raise FormatError("is damaged: it is no JSON object.", file=file, hint=_HINT) from error
     if given != _digest(body):
         raise FormatError("is damaged: its checksum does not fit.", file=file, field="sha256", hint=_HINT)

@@ -156,8 +156,7 @@ def _check(model: GaussianModel) -> None:
         InputError: the message names the row.
     """
     for name in ("means", "quats", "log_scales", "opacity_logits", "sh", "uncertainty"):
-        values = getattr(model, name).detach()
-        bad = ~torch.isfinite(values).reshape(len(model), -1).all(dim=1)
+        bad = ~torch.isfinite(getattr(model, name).detach())[:, None].flatten(1).all(dim=1)
         if bad.any():
             raise InputError(f"row {int(bad.nonzero()[0, 0])} is not finite.", field=name, hint="remove that Gaussian")
     for name, lengths in (("means", model.means.detach().abs()), ("log_scales", model.scales.detach())):
