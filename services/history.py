@@ -131,7 +131,7 @@ class MapHistory:
             The new version that records it.
 
         Raises:
-            VersionNotFoundError: there is none of that number.
+            VersionNotFoundError: no version has that number.
             OtherWorldError: it is of an earlier map of that name.
             NoKeyframesError: the map grows, and the version has no state of a mapper.
             DamagedVersionError: its files are missing or altered.
@@ -165,7 +165,7 @@ class MapHistory:
         """Delete a version.
 
         Raises:
-            VersionNotFoundError: there is none of that number.
+            VersionNotFoundError: no version has that number.
             VersionInUseError: the map answers from it, or a request works on it.
             SaveError: the disk is full or gone.
         """

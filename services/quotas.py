@@ -12,7 +12,7 @@ class Quotas:
     """Counts the maps, jobs and bytes of each client.
 
     A map counts for the client that made it, also if others use it. Maps of the service itself have no owner and count
-    for nobody. The store and the jobs check their numbers themselves, each within its lock.
+    for no client. The store and the jobs check their numbers themselves, each within its lock.
 
     Args:
         settings: limits of one client.

@@ -575,7 +575,7 @@ class Share(BaseModel):
 
 
 class QuotaInfo(BaseModel):
-    """Quota of the client that asks."""
+    """Quota of the caller."""
 
     client: str = Field(description="begin of the hash of its key, or its address")
     requests_per_s: float = Field(description="requests per second in the long run; more are answered 429")

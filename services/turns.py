@@ -1,4 +1,4 @@
-"""Turns at a mapper: the frames in their order, and between two of them whoever needs its whole state."""
+"""Turns at a mapper: the frames in their order, and between two the thread that needs its whole state."""
 
 from __future__ import annotations
 

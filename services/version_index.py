@@ -167,7 +167,7 @@ class VersionIndex:
         if in_reserve:
             with suppress(OSError):
                 self._reserve.unlink(missing_ok=True)
-        with self._connected() as db:  # closing it takes back what is not committed
+        with self._connected() as db:  # closing it undoes an open transaction
             db.execute("BEGIN IMMEDIATE")
             yield db
             failpoints.reach("commit")

@@ -109,7 +109,7 @@ class Versions:
         """Return a version.
 
         Raises:
-            VersionNotFoundError: there is none of that number.
+            VersionNotFoundError: no version has that number.
         """
         found = next((version for version in self.of_map(map_id) if version.number == number), None)
         if found is None:
@@ -154,7 +154,7 @@ class Versions:
         earlier = [v for v in self.of_map(served.id) if v.world == served.world and v.map_version <= served.map_version]
         version = Version(
             map=served.id,
-            number=self._index.next_number(served.id),
+            number=0,
             created=time.time(),
             label=label,
             note=note,
@@ -203,12 +203,10 @@ class Versions:
             VersionsFullError: there is no room for another version.
             SaveError: the index cannot be written.
         """
-        number = self._index.next_number(version.map)
         note = f"version {version.number} again"
         return self._add(
             replace(
                 version,
-                number=number,
                 created=time.time(),
                 label=None,
                 note=note,
@@ -272,9 +270,10 @@ class Versions:
                 self._remove_files(version.folder)
 
     def _add(self, version: Version) -> Version:
-        """Add a version whose files are there."""
+        """Add a version whose files are there, under the next number."""
         with self._lock:
             self._make_room(version, 0)
+            version = replace(version, number=self._index.next_number(version.map))
             self._index.add(version)
             self._count_bytes()
         return version
@@ -324,7 +323,7 @@ class Versions:
         self._bytes = Counter({o: _total([v for v in every if v.owner == o]) for o in {v.owner for v in every}})
 
     def _sweep(self) -> None:
-        """Remove what a killed process left: drafts, and files that no version names."""
+        """Remove the remains of a killed process: drafts, and files that no version names."""
         named = {version.folder for version in self._index.every()}
         for path in self.files.iterdir():
             if path.name not in named and _FILES.fullmatch(path.name.removesuffix(_DRAFT)):

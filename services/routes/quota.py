@@ -1,4 +1,4 @@
-"""The quota of the client that asks."""
+"""The quota of the caller."""
 
 from __future__ import annotations
 
