@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import importlib
-import inspect
 import os
-import shutil
 import signal
 import sys
-import textwrap
 import threading
 import traceback
 import warnings
@@ -108,8 +105,6 @@ _GROUPS = {
     "calibrate": "Calibrate cameras, sensors and arms; `splatbot calibrate --help` lists the calibrations.",
 }
 
-_HELP_COLUMNS = 120  # widest text of a help
-
 _DESCRIPTION = """RGB-D streams become a map of 3D Gaussians on CPUs, and the map answers queries of a robot.
 
 `splatbot COMMAND --help` explains a command with examples. Every command takes --debug (or SPLATBOT_DEBUG=1),
@@ -198,6 +193,8 @@ def _print_warning(
 def _dispatch(words: list[str]) -> Any:
     import tyro
 
+    from splatbot.cli.help import fitted_help, wrapped
+
     if words and words[0] in COMMANDS:
         return _run(words[0], COMMANDS[words[0]], words[1:])
     group = words[0] if words and words[0] in _GROUPS else ""
@@ -208,42 +205,21 @@ def _dispatch(words: list[str]) -> Any:
 
         return run_benchmark(words[1], words[2:])
     # Without a known command, tyro prints the help or names the closest command, and exits.
-    return tyro.extras.subcommand_cli_from_dict(
-        {name: _outline(summary) for name, summary in _summaries(group).items()},
-        prog=f"splatbot {group}".strip(),
-        description=_GROUPS.get(group, _DESCRIPTION),
-        args=words[bool(group) :] or ["--help"],
-    )
+    args = words[bool(group) :] or ["--help"]
+    with fitted_help(args):
+        return tyro.extras.subcommand_cli_from_dict(
+            {name: _outline(summary) for name, summary in _summaries(group).items()},
+            prog=f"splatbot {group}".strip(),
+            description=wrapped(_GROUPS.get(group, _DESCRIPTION)),
+            args=args,
+        )
 
 
 def _run(name: str, command: _Command, words: list[str]) -> Any:
-    import tyro
+    from splatbot.cli.help import parsed
 
     function = getattr(importlib.import_module(command.module), command.function)
-    return tyro.cli(
-        function,
-        prog=f"splatbot {name}",
-        description=description(function),
-        args=words,
-        config=(tyro.conf.FlagCreatePairsOff,),
-    )
-
-
-def description(documented: object) -> str:
-    """Return the docstring of a command up to its "Args:", wrapped to the terminal; tyro would drop the examples.
-
-    Examples stay whole, so that they can be copied. Tyro joins lines that begin with a letter, hence the indentation.
-    """
-    text = inspect.cleandoc(documented.__doc__ or "").split("\nArgs:")[0].rstrip()
-    width = min(shutil.get_terminal_size().columns, _HELP_COLUMNS) - 2
-    paragraphs = []
-    for paragraph in text.split("\n\n"):
-        lines = paragraph.splitlines()
-        plain = not any(line.startswith(" ") for line in lines)
-        paragraphs.append(
-            textwrap.fill(" ".join(lines), width, subsequent_indent=" ", break_on_hyphens=False) if plain else paragraph
-        )
-    return "\n\n".join(paragraphs)
+    return parsed(function, f"splatbot {name}", words)
 
 
 def _summaries(group: str) -> dict[str, str]:

@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import tyro
 from rich.console import Console
 from rich.table import Table as RichTable
 
 from splatbot.bench.benchmark import load_benchmark
-from splatbot.cli import description
 from splatbot.cli.drawing import draw_offscreen
+from splatbot.cli.help import parsed
 from splatbot.cli.tables import print_columns, wide_console
 
 _BUSY_LOAD = 0.5  # load average above which other programs slow the measurement down
@@ -20,13 +19,7 @@ _BUSY_LOAD = 0.5  # load average above which other programs slow the measurement
 def run_benchmark(name: str, words: Sequence[str]) -> int:
     """Parse the options, run the benchmark, and print its tables; return the exit code."""
     benchmark = load_benchmark(name)
-    settings = tyro.cli(
-        benchmark.settings,
-        prog=f"splatbot bench {name}",
-        description=description(benchmark.settings),
-        args=words,
-        config=(tyro.conf.FlagCreatePairsOff,),
-    )
+    settings = parsed(benchmark.settings, f"splatbot bench {name}", words)
     settings.validate()
     draw_offscreen()  # before any import of mujoco
     results = benchmark.run(settings, _report_progress)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -15,7 +17,7 @@ import pytest
 
 import splatbot
 from splatbot.bench.benchmark import BENCHMARKS, Settings, load_benchmark
-from splatbot.cli import COMMANDS
+from splatbot.cli import CALIBRATIONS, COMMANDS
 from splatbot.errors import LogError, MapNotFoundError, SplatbotError
 from tests.unit.cli.conftest import RunCommand
 
@@ -87,6 +89,46 @@ def test_the_help_lists_every_command(run: RunCommand) -> None:
         for name, member in members.items():
             assert name in answer.out
             assert member.summary.split()[0] in answer.out
+
+
+_EVERY_HELP = [
+    *([name] for name in COMMANDS),
+    *(["calibrate", name] for name in CALIBRATIONS),
+    *(["bench", name] for name in BENCHMARKS),
+    [],
+    ["calibrate"],
+    ["bench"],
+]
+
+
+@pytest.mark.parametrize("words", _EVERY_HELP, ids=" ".join)
+def test_no_help_exceeds_80_columns_or_prints_a_default_of_python(
+    run: RunCommand, monkeypatch: pytest.MonkeyPatch, words: list[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    answer = run(*words, "--help")
+    assert answer.code == 0
+    lines = answer.out.splitlines()
+    assert [line for line in lines if len(line) > 80 and " " in line.strip()] == []
+    assert not re.search(r"default: (True|False|None)", " ".join(line.strip("│ ") for line in lines))
+    assert not any(re.fullmatch(r"│\s+│", line) for line in lines)
+
+
+def test_an_example_that_is_wider_than_the_terminal_can_still_be_copied(
+    run: RunCommand, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    example = "splatbot plan --map runs/latest --robot ur5e-2f85 --start home --grasp runs/grasp/grasp.json"
+    assert example in (inspect.getdoc(importlib.import_module("splatbot.cli.plan").plan) or "")
+    monkeypatch.setenv("COLUMNS", "80")
+    joined = run("plan", "--help").out.replace("\\\n", "")  # as a shell joins them
+    assert shlex.split(example) in [shlex.split(line) for line in joined.splitlines() if "splatbot plan --map" in line]
+
+
+def test_the_help_names_flags_that_turn_a_default_off(run: RunCommand, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    line = next(line for line in run("plan", "--help").out.splitlines() if "--no-support" in line)
+    assert "--support " not in line
+    assert "this option turns it off" in run("plan", "--help").out
 
 
 def test_no_words_at_all_show_the_help(run: RunCommand) -> None:
