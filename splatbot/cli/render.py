@@ -63,7 +63,7 @@ def render(
         video: MP4 of a fly-through, instead of a PNG; a map file needs --trajectory.
         seconds: length of the video [s].
         pixel_error: of a tiled map: largest edge of a cell of merged Gaussians [px], by default 1. 0 is exact.
-        memory_mb: of a tiled map: memory of tiles [MB], by default 32.
+        memory_mb: of a tiled map: memory of tiles [MB], by default 24.
     """
     width, height = _parse_size(size)
     is_tiled = is_tiled_map(map_)

@@ -46,7 +46,7 @@ def tile(
         out: folder to write.
         tile_gaussians: largest number of Gaussians of a tile; by default 16,384.
         sweep: then print accuracy, memory and time of views and queries.
-        memory_mb: with --sweep, memory of tiles [MB]; by default 32.
+        memory_mb: with --sweep, memory of tiles [MB]; by default 24.
         overwrite: replace the tiled map that --out names.
     """
     file = map_file(map)

@@ -100,11 +100,11 @@ class QueryScore:
 
 
 def supersampled(model: GaussianModel, camera: Camera, T_world_camera: Array) -> SweepView:
-    """Return a view whose reference is the whole map, with several rays a pixel."""
+    """Return a view whose reference is the whole map with several rays a pixel, of 8 bits as recorded images have."""
     k = CONSTANTS.supersampling
     large = render_view(model, camera.resized(k * camera.width, k * camera.height), T_world_camera)
     reference = large.reshape(camera.height, k, camera.width, k, 3).mean(axis=(1, 3))
-    return SweepView(camera, T_world_camera, reference)
+    return SweepView(camera, T_world_camera, np.rint(255.0 * reference) / np.float32(255.0))
 
 
 def score_views(

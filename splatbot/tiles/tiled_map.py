@@ -42,7 +42,7 @@ class TiledMapConstants:
         fov_margin: share of half the image beyond which it clamps the slope of the projection.
     """
 
-    memory_mb: float = 32.0
+    memory_mb: float = 24.0
     pixel_error: float = 1.0
     slack: float = 1e-4
     sigmas: float = 3.34

@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from splatbot.formats.ply import save_ply
 from tests.unit.cli.conftest import RunCommand, assert_fix_named, assert_refused
@@ -29,6 +30,10 @@ def tiled(run: RunCommand, source: Path) -> Path:
     return source.with_name("tiles")
 
 
+def image(path: str) -> NDArray[np.uint8]:
+    return np.asarray(cv2.imread(path), dtype=np.uint8)
+
+
 def test_the_folder_is_described_by_levels(run: RunCommand, tiled: Path) -> None:
     answer = run("info", tiled)
     assert answer.code == 0, answer.err
@@ -43,15 +48,14 @@ def test_an_exact_view_of_the_tiles_is_the_view_of_the_map(run: RunCommand, sour
     assert run("render", source, *words, "--out", "whole.png").code == 0
     answer = run("render", tiled, *words, "--out", "tiles.png", "--pixel-error", 0)
     assert answer.code == 0, answer.err
-    whole, tiles = cv2.imread("whole.png"), cv2.imread("tiles.png")
-    assert whole.any()
-    assert np.array_equal(whole, tiles)
+    assert image("whole.png").any()
+    assert np.array_equal(image("whole.png"), image("tiles.png"))
 
 
 def test_a_view_without_a_pose_shows_most_of_the_map(run: RunCommand, tiled: Path) -> None:
     answer = run("render", tiled, "--mode", "alpha", "--size", "96x64")
     assert answer.code == 0, answer.err
-    assert (cv2.imread("tiles-alpha.png", cv2.IMREAD_GRAYSCALE) > 0).mean() > 0.1
+    assert np.mean(image("tiles-alpha.png") > 0) > 0.1
 
 
 def test_a_view_that_memory_cannot_refine_is_drawn_with_a_warning(run: RunCommand, tiled: Path) -> None:

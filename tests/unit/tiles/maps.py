@@ -36,7 +36,7 @@ def building(n: int, *, seed: int = 0, side: float = SIDE, degree: int = 0, size
         quats=np.tile((2.0, 0.0, 0.0, 0.0), (n, 1)) + 0.05 * rng.normal(size=(n, 4)),
         scales=scales,
         opacities=rng.uniform(0.3, 0.95, n),
-        colors=0.5 + 0.4 * np.sin(2.0 * means + means[:, ::-1]),
+        colors=0.5 + 0.3 * np.sin(2.0 * means + means[:, ::-1]) + rng.uniform(-0.2, 0.2, (n, 3)),
     )
     rest = torch.from_numpy(0.05 * rng.normal(size=(n, (degree + 1) ** 2 - 1, 3))).float()
     return GaussianModel(

@@ -43,8 +43,8 @@ def test_the_bounds_of_each_tile_hold_its_gaussians(tmp_path: Path) -> None:
     with TiledMap(tmp_path) as tiles:
         for number, tile in enumerate(index.tiles):
             part = tiles._load(number).model
-            assert (part.means.numpy() >= np.float32(tile.low)).all()
-            assert (part.means.numpy() <= np.float32(tile.high)).all()
+            assert (part.means.numpy() >= np.array(tile.low, np.float32)).all()
+            assert (part.means.numpy() <= np.array(tile.high, np.float32)).all()
             assert float(part.scales.max()) <= tile.scale * (1 + 1e-6)
 
 
