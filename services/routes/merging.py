@@ -20,7 +20,7 @@ router = APIRouter(prefix="/v1/maps", tags=["versions"])
 _MERGE = {"two maps": {"id": "both", "other": "tuesday"}}
 _DIFF = {
     "another map": {"other": "tuesday"},
-    "an earlier version of this map": {"version": 1, "other": "default"},
+    "an earlier version of this map": {"version": 1, "other": "monday"},
 }
 
 

@@ -16,6 +16,7 @@ import pytest
 from fastapi import FastAPI
 from numpy.typing import NDArray
 
+from splatbot.config import Config
 from splatbot.gaussians import GaussianModel, Snapshot
 from splatbot.geometry import pose_from_quat
 from splatbot.service_key import key_file, read_key
@@ -67,9 +68,11 @@ def generated_requests(service: Service) -> dict[str, Any]:
 
 
 @contextmanager
-def running(settings: ServiceSettings, store: MapStore | None = None) -> Iterator[Service]:
+def running(
+    settings: ServiceSettings, store: MapStore | None = None, *, config: Config | None = None
+) -> Iterator[Service]:
     """Run a real server on a real socket until the block ends."""
-    runtime = Runtime(settings, store)
+    runtime = Runtime(settings, store, config=config)
     app = create_app(runtime)
     server = Server(runtime, app, [("127.0.0.1", 0)])
     thread = threading.Thread(target=server.run, args=(list(server.listeners),), daemon=True)

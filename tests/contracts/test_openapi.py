@@ -19,10 +19,10 @@ SETTINGS = ServiceSettings(
 
 
 @pytest.fixture(scope="module")
-def api() -> Iterator[Service]:
+def api(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
     store = MapStore()
-    store.add("default", source="wall.ply", state="static", snapshot=wall())
-    with running(SETTINGS, store) as service:
+    store.add("default", source="a log", state="ended", snapshot=wall())
+    with running(SETTINGS.model_copy(update={"data_dir": tmp_path_factory.mktemp("maps")}), store) as service:
         yield service
 
 
