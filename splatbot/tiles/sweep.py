@@ -22,7 +22,7 @@ Image = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
-class SweepConstants:
+class TileSweepConstants:
     """Constants of sweeps.
 
     Args:
@@ -44,7 +44,7 @@ class SweepConstants:
     seed: int = 0
 
 
-CONSTANTS = SweepConstants()
+CONSTANTS = TileSweepConstants()
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +57,7 @@ class SweepView:
 
 
 @dataclass(frozen=True)
-class ViewScore:
+class TiledViewScore:
     """Views of a tiled map at one pixel error.
 
     Args:
@@ -79,7 +79,7 @@ class ViewScore:
 
 
 @dataclass(frozen=True)
-class QueryScore:
+class TiledQueryScore:
     """Collision queries in boxes of a tiled map, each by a map that was just opened.
 
     Args:
@@ -109,7 +109,7 @@ def supersampled(model: GaussianModel, camera: Camera, T_world_camera: Array) ->
 
 def score_views(
     model: GaussianModel, folder: Path, views: Sequence[SweepView], *, memory_mb: float
-) -> Iterator[ViewScore]:
+) -> Iterator[TiledViewScore]:
     """Yield the score of each pixel error.
 
     Args:
@@ -134,10 +134,10 @@ def score_views(
             table = np.array(rows)
             _, gaussians, load_ms, render_ms, own, _ = table.mean(axis=0).tolist()
             reached, least = float(table[:, 0].max()), float(table[:, 5].min())
-            yield ViewScore(pixel_error, reached, round(gaussians), load_ms, render_ms, own, least)
+            yield TiledViewScore(pixel_error, reached, round(gaussians), load_ms, render_ms, own, least)
 
 
-def score_queries(model: GaussianModel, folder: Path, *, memory_mb: float) -> QueryScore:
+def score_queries(model: GaussianModel, folder: Path, *, memory_mb: float) -> TiledQueryScore:
     """Compare verdicts in boxes around random Gaussians with those of the whole map.
 
     Raises:
@@ -167,4 +167,6 @@ def score_queries(model: GaussianModel, folder: Path, *, memory_mb: float) -> Qu
             hits += int(expected.sum())
             different += int((field.in_collision(spheres) != expected).sum())
     open_ms, field_ms, query_ms = (1e3 * np.max(times, axis=0)).tolist()
-    return QueryScore(open_ms, field_ms, query_ms, max(sizes), CONSTANTS.places * CONSTANTS.spheres, hits, different)
+    return TiledQueryScore(
+        open_ms, field_ms, query_ms, max(sizes), CONSTANTS.places * CONSTANTS.spheres, hits, different
+    )

@@ -70,7 +70,7 @@ def write_tiles(
     def write_data(path: Path) -> None:
         nonlocal index
         with atomic_write(path) as file:
-            writer = _Writer(model, tile_gaussians, file)
+            writer = _TileWriter(model, tile_gaussians, file)
             writer.write_all()
         index = index.model_copy(update={"tiles": tuple(writer.tiles)})
 
@@ -82,7 +82,7 @@ def write_tiles(
 
 
 @dataclass
-class _Writer:
+class _TileWriter:
     """Writes the tiles of a map, children before their parent."""
 
     model: GaussianModel
