@@ -35,7 +35,7 @@ MAP_NAME = "map.ply"
 TILES_NAME = "tiles.json"
 RECORDING = "recording.mcap"
 TRAINING_NAME = "training.json"
-MAP_SUFFIXES = (".ply", ".splat", ".spz", ".sbz", ".sog", ".glb")
+MAP_SUFFIXES = (".ply", ".splat", ".spz", ".sbz", ".sog", ".glb", ".usd", ".usda", ".usdc", ".usdz")
 """Ends of the names of map files that splatbot.formats reads."""
 
 _SOG_NAME = "meta.json"  # of a map in a folder of WebP images
@@ -83,10 +83,6 @@ _FOREIGN_LOGS = {
 }
 _FOREIGN_MAPS = {
     ".ksplat": ("a .ksplat file", _AS_PLY),
-    **dict.fromkeys(
-        (".usd", ".usda", ".usdc", ".usdz"),
-        ("an OpenUSD file", f"export its Gaussians in a format that splatbot reads ({', '.join(MAP_SUFFIXES)})"),
-    ),
     ".gltf": ("a glTF file in several parts", "pack it as one .glb file"),
     **dict.fromkeys((".pcd", ".las", ".e57"), ("a point cloud", _FROM_A_LOG)),
     **dict.fromkeys((".obj", ".stl"), ("a mesh", _FROM_A_LOG)),

@@ -28,8 +28,8 @@ def convert(
 ) -> int:
     """Write a map in another format of Gaussian splats, as the suffix of OUT says.
 
-    The suffixes are .ply (3DGS PLY), .compressed.ply, .splat, .spz, .sbz, .sog, _sog (a folder) and .glb (glTF with
-    KHR_gaussian_splatting). The format of MAP is detected from its content.
+    The suffixes are .ply (3DGS PLY), .compressed.ply, .splat, .spz, .sbz, .sog, _sog (a folder), .glb (glTF with
+    KHR_gaussian_splatting), .usd, .usda, .usdc and .usdz (OpenUSD). The format of MAP is detected from its content.
 
     Prints the losses. Only .ply keeps all values. The bookkeeping of splatbot (observations, anchors, uncertainty and
     misses of each Gaussian) is kept by .ply and .sbz.
@@ -38,6 +38,7 @@ def convert(
         splatbot convert runs/desk desk.spz
         splatbot convert runs/desk desk.sbz
         splatbot convert scene.sog scene.ply
+        splatbot convert runs/desk desk.usdz
         splatbot convert map.ply map.compressed.ply --sh-degree 0
         splatbot convert map.ply map.spz --spz-version 4
 

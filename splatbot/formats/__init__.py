@@ -61,6 +61,10 @@ FORMATS = (
     MapFormat("SOG", ".sog", "sog", 3, _ALL),
     MapFormat("SOG folder", "_sog", "sog", 3, _ALL),
     MapFormat("glTF with KHR_gaussian_splatting", ".glb", "glb", 3),
+    MapFormat("OpenUSD", ".usd", "usd", 3),
+    MapFormat("OpenUSD text", ".usda", "usd", 3),
+    MapFormat("OpenUSD binary", ".usdc", "usd", 3),
+    MapFormat("OpenUSD package", ".usdz", "usd", 3),
 )
 """Formats of maps; a name has the format of the first suffix that it ends in."""
 
@@ -70,6 +74,7 @@ WRITTEN = tuple(entry.suffix[1:] for entry in FORMATS if entry.suffix.startswith
 _KNOWN = ", ".join(f"{entry.name} ({entry.suffix})" for entry in FORMATS)
 _BY_MODULE = {entry.module: entry for entry in reversed(FORMATS)}
 _MAGIC = {b"ply": "ply", b"NGSP": "spz", b"SBZ": "sbz", b"\x1f\x8b": "spz", b"PK": "sog", b"{": "sog", b"glTF": "glb"}
+_MAGIC |= {b"#usd": "usd", b"PXR-": "usd"}
 
 
 def load_gaussians(path: str | Path) -> GaussianModel:
@@ -91,6 +96,8 @@ def load_gaussians(path: str | Path) -> GaussianModel:
         module = "splat"
     elif module == "ply" and _has_chunks(place):
         module = "compressed_ply"
+    elif magic[:2] == b"PK" and _begins_with_usd(place):
+        module = "usd"
     if module is None:
         found = f"begins with {magic!r}" if magic else "is empty"
         hint = f"known formats: {_KNOWN}"
@@ -127,3 +134,10 @@ def _has_chunks(path: Path) -> bool:
     from splatbot.formats.ply_file import read_ply_header
 
     return any(element.name == "chunk" for element in read_ply_header(path).elements)
+
+
+def _begins_with_usd(path: Path) -> bool:
+    """Return whether the first file of a ZIP archive is an OpenUSD file, as in a package."""
+    with path.open("rb") as file:
+        header = file.read(30)
+        return file.read(int.from_bytes(header[26:28], "little")).endswith((b".usd", b".usda", b".usdc"))

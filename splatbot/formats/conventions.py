@@ -12,9 +12,11 @@ last. Axes are x right, y down, z forward (RDF), as in COLMAP and OpenCV.
 | SPZ | RUB (:data:`RUB`) | logarithm | 0..1 | xyzw |
 | SOG | RDF | logarithm | 0..1 | wxyz |
 | glTF | LUF (:data:`LUF`) | linear | 0..1 | xyzw |
+| OpenUSD | RUB, or Z up (:data:`Y_UP_FROM_Z_UP`) | linear | 0..1 | xyzw |
 
 Letters name the directions of x, y and z: Right or Left, Up or Down, Forward or Back. The axes of SPZ and PLY are those
-of Niantic's converter. glTF 2.0 (section 3.4) defines +Y up, +Z forward and -X right.
+of Niantic's converter. glTF 2.0 (section 3.4) defines +Y up, +Z forward and -X right. Arrays of quaternions of OpenUSD
+are xyzw in memory, and wxyz in its text. A file of it states its unit, 1 cm by default, and whether Y or Z is up.
 """
 
 from __future__ import annotations
@@ -27,8 +29,8 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from splatbot.errors import InputError
-from splatbot.formats.checks import Table, check_finite, replace_degenerate
+from splatbot.errors import FormatError, InputError
+from splatbot.formats.checks import Table, check_finite, damaged, replace_degenerate
 from splatbot.gaussians.harmonics import SH_C0
 from splatbot.gaussians.model import OPACITY_MAX, OPACITY_MIN, GaussianModel
 from splatbot.geometry import quat_multiply, rotation_to_quat
@@ -42,6 +44,11 @@ RUB: Signs = (1, -1, -1)
 
 LUF: Signs = (-1, -1, 1)
 """Signs of x, y and z between RDF and left, up, forward."""
+
+Y_UP_FROM_Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+"""Turn (4, 4) from axes right, forward, up to axes right, up, back."""
+
+_STRETCH = 1e-4  # largest deviation of a placed pose from a rotation times a scale
 
 
 class SplatArrays(NamedTuple):
@@ -190,6 +197,24 @@ def move(splats: SplatArrays, rotation: NDArray[np.float64], shift: NDArray[np.f
         splats.opacity_logits,
         rotate_harmonics(splats.sh, rotation),
     )
+
+
+def place(path: str | Path, splats: SplatArrays, T: NDArray[np.float64], field: str) -> SplatArrays:
+    """Move splats by a matrix (4, 4) that a file states: a rotation, a shift and one scale.
+
+    Raises:
+        FormatError: the matrix is singular, or mirrors or stretches the splats.
+    """
+    if np.array_equal(T, np.eye(4)):
+        return splats
+    scale = float(np.cbrt(np.linalg.det(T[:3, :3])))
+    if not (np.isfinite(T).all() and scale > 0):
+        raise damaged(path, field, "a pose is singular or mirrors")
+    rotation = T[:3, :3] / scale
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() > _STRETCH:
+        hint = "apply the scale of the node before the export"
+        raise FormatError("stretches the splats unevenly.", file=path, field=field, hint=hint)
+    return move(splats, rotation, T[:3, 3], scale)
 
 
 def rotate_harmonics(sh: Table, rotation: NDArray[np.float64]) -> Table:

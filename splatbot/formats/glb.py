@@ -26,7 +26,7 @@ from splatbot.formats.conventions import (
     linear_scales,
     logit,
     model_of,
-    move,
+    place,
     sigmoid,
     splats_of,
     to_wxyz,
@@ -50,7 +50,6 @@ _DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 _FLOAT, _UNSIGNED_BYTE = 5126, 5121
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 _MAX_PRIMITIVES = 10_000
-_STRETCH = 1e-4  # deviation of a node's matrix from a rotation times a scale
 _HINT = f"export the map as GLB with {EXTENSION} again"
 
 
@@ -75,7 +74,7 @@ def load_glb(path: str | Path) -> GaussianModel:
         sizes = [_decoded_bytes(primitive) * count for (_, primitive), count in zip(placed, counts, strict=True)]
         check_expansion(path, sum(sizes), len(data), "POSITION")
         models = [
-            model_of(path, turn(_place(path, _read_splats(path, document, binary, primitive), T), LUF))
+            model_of(path, turn(place(path, _read_splats(path, document, binary, primitive), T, "nodes"), LUF))
             for T, primitive in placed
         ]
     except (LookupError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
@@ -227,20 +226,6 @@ def _pose(node: Json) -> Pose:
     T[:3, :3] = quat_to_rotation(to_wxyz(rotation))[0] * np.array(node.get("scale", [1.0] * 3), np.float64).reshape(3)
     T[:3, 3] = np.array(node.get("translation", [0.0] * 3), np.float64).reshape(3)
     return T
-
-
-def _place(path: str | Path, splats: SplatArrays, T: Pose) -> SplatArrays:
-    """Move splats of a node to the pose of the node."""
-    if np.array_equal(T, np.eye(4)):
-        return splats
-    scale = float(np.cbrt(np.linalg.det(T[:3, :3])))
-    if not (np.isfinite(T).all() and scale > 0):
-        raise damaged(path, "nodes", "a pose is singular or mirrors")
-    rotation = T[:3, :3] / scale
-    if np.abs(rotation @ rotation.T - np.eye(3)).max() > _STRETCH:
-        hint = "apply the scale of the node before the export"
-        raise FormatError("stretches the splats unevenly.", file=path, field="nodes", hint=hint)
-    return move(splats, rotation, T[:3, 3], scale)
 
 
 def _read_splats(path: str | Path, document: Json, binary: bytes, primitive: Json) -> SplatArrays:

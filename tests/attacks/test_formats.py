@@ -19,6 +19,7 @@ from splatbot.gaussians import GaussianModel
 from tests.unit.formats.models import detailed_model
 
 CASES, MANY = 150, 5000
+SLOWER = 30  # times, because another process reads each OpenUSD file
 MAX_GROWTH_KB = 300_000  # of the process: below the 64 MiB that a header may claim without proof, in float32
 
 
@@ -97,11 +98,17 @@ def attack(path: Path, count: int, seed: int) -> int:
     return refused
 
 
+def cases(name: str, usual: int) -> int:
+    """Return the number of damaged copies of a file."""
+    return usual // SLOWER if ".usd" in name else usual
+
+
 @pytest.mark.parametrize("name", sorted(WRITERS))
 def test_damaged_maps_are_refused_or_read(tmp_path: Path, name: str) -> None:
     path = tmp_path / name
     WRITERS[name](detailed_model(80, degree=1), path)
-    assert attack(path, CASES, seed=1) > CASES // 10
+    count = cases(name, CASES)
+    assert attack(path, count, seed=1) > count // 10
 
 
 @pytest.mark.parametrize("name", sorted(WRITERS))
@@ -109,7 +116,8 @@ def test_damaged_maps_are_refused_or_read(tmp_path: Path, name: str) -> None:
 def test_many_damaged_maps_are_refused_or_read(tmp_path: Path, name: str) -> None:
     path = tmp_path / name
     WRITERS[name](detailed_model(80, degree=1), path)
-    assert attack(path, MANY, seed=2) > MANY // 10
+    count = cases(name, MANY)
+    assert attack(path, count, seed=2) > count // 10
 
 
 def test_the_peak_of_memory_is_measured_anew() -> None:

@@ -152,7 +152,7 @@ def test_a_file_is_recognized_by_its_suffix(tmp_path: Path, name: str, kind: str
     ("name", "fix"),
     [
         ("a.ksplat", "superspl"),
-        ("a.usdz", r"\.spz, \.sbz, \.sog, \.glb"),
+        ("a.stl", r"\.spz, \.sbz, \.sog, \.glb, \.usd"),
         ("a.gltf", r"one \.glb"),
         ("a.obj", r"\.glb"),
     ],

@@ -74,7 +74,7 @@ def test_files_of_every_format_are_maps(tmp_path: Path, suffix: str) -> None:
 
 def test_the_suffixes_of_maps_are_those_of_the_formats() -> None:
     assert set(MAP_SUFFIXES) == {Path(f"map{suffix}").suffix for suffix in SUFFIXES if suffix.startswith(".")}
-    assert set(WRITTEN) == {"ply", "compressed.ply", "splat", "spz", "sbz", "sog", "glb"}
+    assert set(WRITTEN) == {"ply", "compressed.ply", "splat", "spz", "sbz", "sog", "glb", "usd", "usda", "usdc", "usdz"}
 
 
 @pytest.mark.parametrize(
@@ -85,7 +85,7 @@ def test_the_suffix_names_the_format(name: str, wanted: str) -> None:
     assert find_format(name).module == wanted
 
 
-@pytest.mark.parametrize("name", ["map.obj", "map", "map.ksplat", "map.usdz", "map.gz"])
+@pytest.mark.parametrize("name", ["map.obj", "map", "map.ksplat", "map.usd.gz", "map.gz"])
 def test_an_unknown_suffix_lists_the_known_ones(name: str) -> None:
     with pytest.raises(FormatError, match=r"Fix: use .*\.spz.*\.glb") as caught:
         find_format(name)

@@ -1,0 +1,64 @@
+"""Attributes of the Gaussians of an OpenUSD file, read in a process of their own.
+
+OpenUSD aborts its process on some damaged files. So :func:`splatbot.formats.usd.load_usd` runs this module as a
+program. Its arguments are the file, the file to write and the largest memory [bytes]. The caller checks the values.
+"""
+
+from __future__ import annotations
+
+import json
+import resource
+import sys
+from typing import Any
+
+import numpy as np
+
+POSITIONS, ORIENTATIONS, SCALES, OPACITIES = "positions", "orientations", "scales", "opacities"
+SH, DEGREE = "radiance:sphericalHarmonicsCoefficients", "radiance:sphericalHarmonicsDegree"
+
+Arrays = dict[str, np.ndarray[Any, np.dtype[Any]]]
+
+
+def main(source: str, target: str, memory: str) -> None:
+    """Write the prims of Gaussians of a file as arrays of numpy.
+
+    The arrays are named after the number of the prim and the attribute; `pose` is T_stage_prim (4, 4). The text `facts`
+    is JSON: `others` are the files that the layer needs, in which case nothing else is read.
+    """
+    resource.setrlimit(resource.RLIMIT_DATA, (int(memory), int(memory)))
+    from pxr import Sdf, Usd, UsdGeom
+
+    layer = Sdf.Layer.FindOrOpen(source)
+    facts: dict[str, Any] = {"others": list(layer.GetCompositionAssetDependencies())}
+    content: dict[str, Any] = {}
+    if not facts["others"]:
+        stage = Usd.Stage.Open(layer)
+        facts |= {"unit": UsdGeom.GetStageMetersPerUnit(stage), "up": UsdGeom.GetStageUpAxis(stage), "prims": []}
+        poses = UsdGeom.XformCache(Usd.TimeCode.EarliestTime())
+        for index, prim in enumerate(prim for prim in stage.Traverse() if _holds_gaussians(prim)):
+            facts["prims"].append({"path": str(prim.GetPath()), "degree": int(prim.GetAttribute(DEGREE).Get())})
+            pose = np.array(poses.GetLocalToWorldTransform(prim)).T  # OpenUSD multiplies rows from the left
+            content |= {f"{index} {name}": values for name, values in (_attributes(prim) | {"pose": pose}).items()}
+    np.savez(target, **content, facts=np.array(json.dumps(facts)))
+
+
+def _holds_gaussians(prim: Any) -> bool:
+    from pxr import UsdVol
+
+    return bool(prim.IsA(UsdVol.ParticleField3DGaussianSplat))
+
+
+def _attributes(prim: Any) -> Arrays:
+    """Return the values at the earliest time that the file states, in float32 or else in half precision."""
+    from pxr import Usd
+
+    time = Usd.TimeCode.EarliestTime()
+    found = {
+        name: prim.GetAttribute(name).Get(time) or prim.GetAttribute(f"{name}h").Get(time)
+        for name in (POSITIONS, ORIENTATIONS, SCALES, OPACITIES, SH)
+    }
+    return {name: np.array(values, np.float32) for name, values in found.items() if values}
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
