@@ -1,4 +1,4 @@
-"""Versions, merge and diff over HTTP, on a real socket: what is answered after a restoration, and who may do it."""
+"""Versions, merge and diff over HTTP, on a real socket: answers after a restoration, and the rights of keys."""
 
 from __future__ import annotations
 

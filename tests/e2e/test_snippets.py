@@ -17,6 +17,7 @@ import pytest
 
 from splatbot.bench.tabletop import tabletop
 from splatbot.cli import main
+from splatbot.client import Client
 from splatbot.collision import RobotSpheres
 from splatbot.frame import PosePrior
 from splatbot.gaussians import GaussianModel
@@ -29,6 +30,7 @@ from splatbot.robots.controllers import FakeController
 from splatbot.robots.grippers import FakeGripper
 from splatbot.robots.panda import panda
 from splatbot.segmentation import segment
+from splatbot.service_key import key_file
 from splatbot.serving import serving
 from tests.fake_ros_arm import FakeRosArm
 from tests.unit.grasping.objects import CAN, OBJECTS, colored
@@ -128,6 +130,7 @@ OF_A_SERVICE = [
     "docs/guide/ros.md",
     "docs/guide/service.md",
     "docs/guide/several-cameras.md",
+    "docs/guide/versions.md",
 ]
 OF_AN_ARM = "docs/guide/arms.md"
 
@@ -144,7 +147,7 @@ def test_the_snippets_of_a_document_run_in_turn(name: str, desk: Path, monkeypat
 @pytest.fixture(scope="module")
 def served(desk: Path) -> Iterator[str]:
     """Address of a service of the map."""
-    with serving("--map", str(desk / "runs" / "desk"), log=desk / "log.txt") as service:
+    with serving("--map", str(desk / "runs" / "desk"), "--data", str(desk / "maps"), log=desk / "log.txt") as service:
         yield service.url
 
 
@@ -168,6 +171,22 @@ def test_the_snippets_of_a_client_run_against_a_service(name: str, served: str) 
             here += "ros.terminate()\n"
         done = subprocess.run([sys.executable, "-c", here], capture_output=True, text=True, timeout=120, check=False)
         assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.long
+def test_the_curl_requests_of_versions_are_answered(served: str) -> None:
+    (commands,) = re.findall(r"```sh\n(.*?)```", (ROOT / "docs" / "guide" / "versions.md").read_text(), re.DOTALL)
+    log = "synthetic:tabletop?frames=16&width=160&height=120"
+    with Client(served) as robot:
+        for name in ("monday", "tuesday"):
+            assert robot.wait(robot.create_map(name, log)["id"])["state"] == "succeeded"
+        here = commands.replace("localhost:8000", served.split("//")[1])
+        here = "set -e\n" + here.replace("~/.local/state/splatbot/service-key", str(key_file()))
+        done = subprocess.run(["bash", "-c", here], capture_output=True, text=True, timeout=120, check=False)
+        assert done.returncode == 0, done.stdout + done.stderr
+        listed = json.loads(robot.request("GET", "/v1/jobs")[0])["jobs"]
+        jobs = [job for job in listed if job["kind"] in ("diff", "merge")]
+        assert [robot.wait(job["id"])["state"] for job in jobs[-2:]] == ["succeeded"] * 2
 
 
 @pytest.fixture(scope="module")
