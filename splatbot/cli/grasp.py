@@ -170,7 +170,7 @@ def grasp(
             hand = [part for part in appearance(arm, shown.opening) if part.link == len(arm)]
             handle.write(grasp_png(scene, found.rows, shown, hand, arm.T_link_tcp))
     if not result.grasps and not verbose:
-        reason, change = first_change(result, scene, stroke_of(arm))
+        reason, change = first_change(result, scene, stroke_of(arm), samples)
         why = " ".join(note for note in found.notes if note.startswith("took "))
         raise SplatbotError(f"cannot be grasped: {reason}. {why}".strip(), field=found.label, hint=change)
     result.unwrap()
@@ -317,7 +317,7 @@ def _print(result: GraspResult, folder: Path, margin: str, *, verbose: bool) -> 
     terms = list(result.grasps[0].terms) if verbose else []
     contacts = ["contacts"] if result.grasps[0].implied else []
     table = Table()
-    for name in ("", "total", "conf.", "from", "width", "opens", "clear", *contacts, *terms):
+    for name in ("grasp", "total", "conf.", "from", "width", "opens", "clear", *contacts, *terms):
         table.add_column(name, justify="left" if name == "from" else "right")
     for k, g in enumerate(result.grasps):
         lengths = (f"{1e3 * value:.1f}" for value in (g.width, g.opening, g.clearance))
@@ -325,6 +325,7 @@ def _print(result: GraspResult, folder: Path, margin: str, *, verbose: bool) -> 
         values = (f"{g.terms[name]:.2f}" for name in terms)
         table.add_row(str(k), f"{g.total:.3f}", f"{g.confidence:.2f}", g.approach, *lengths, *contact, *values)
     print_columns(table)
+    print_text("grasp: its rank from 0, as plan and plan-pick take it (--grasp-index)")
     print_text("from: above (top, within 40 degrees), level away from the robot (front), level (side), else (free)")
     print_text("width of the closed hand, opening on the approach, and clearance from the surroundings, in mm")
     print_text("the best total is 1; --verbose prints its terms, of which the best value is 1")

@@ -259,17 +259,19 @@ def _info(name: str) -> None:
     rows = [
         (
             j.name,
-            f"{j.lower:+.4f} .. {j.upper:+.4f}, at most {j.velocity:g}/s, {j.acceleration:g}/s², effort {j.effort:g}",
+            f"{j.lower:+.4f} .. {j.upper:+.4f} {unit}, at most {j.velocity:g} {unit}/s, {j.acceleration:g} {unit}/s², "
+            f"{j.effort:g} {effort}",
         )
         for j in model.joints
+        for unit, effort in (("m", "N") if j.prismatic else ("rad", "Nm"),)
     ]
     print_table(rows, title=f"{model.name}: {len(model)} joints")
     print_table(
         [
             ("spheres", f"{len(spheres)}, radius {spheres.radii.min():.3f} .. {spheres.radii.max():.3f} m"),
-            ("slack", f"{1e3 * model.slack:.3g} mm"),
+            ("slack", f"at most {1e3 * model.slack:.3g} mm of the spheres beyond the geometry"),
             ("pairs of links that may not touch", str(len(model.self_collision_pairs))),
-            ("home", " ".join(f"{value:.4g}" for value in model.home)),
+            ("home", " ".join(f"{value:.4g}" for value in model.home) + f" {_unit_of(model)}"),
             ("gripper", _gripper_text(model)),
             ("tool (TCP)", _tool_text(model)),
             ("links in TF", _links_text(model)),
@@ -278,11 +280,17 @@ def _info(name: str) -> None:
     )
 
 
+def _unit_of(model: RobotModel) -> str:
+    """Return the unit of joint values."""
+    kinds = {joint.prismatic for joint in model.joints}
+    return "rad or m" if len(kinds) == 2 else "m" if True in kinds else "rad"
+
+
 def _gripper_text(model: RobotModel) -> str:
     gripper = model.gripper
     if gripper is None:
         return "none"
-    return f"opens {2 * gripper.stroke:g} m, {gripper.force:g} N, {gripper.speed:g} m/s each finger"
+    return f"opens {2 * gripper.stroke:g} m, force {gripper.force:g} N, {gripper.speed:g} m/s each finger"
 
 
 def _links_text(model: RobotModel) -> str:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from splatbot.grasping.object_list import obstacle
+from splatbot.grasping.options import GraspOptions
 from splatbot.grasping.types import FITTING, GraspResult
 from splatbot.segmentation import SegmentedMap
 
+_USUAL_SAMPLES = GraspOptions().samples
 _CHANGES = (
     (
         "farther apart than the hand opens",
@@ -56,14 +58,21 @@ _CHANGES = (
 )
 
 
-def first_change(result: GraspResult, scene: SegmentedMap, stroke: float) -> tuple[str, str]:
+def first_change(
+    result: GraspResult, scene: SegmentedMap, stroke: float, samples: int = _USUAL_SAMPLES
+) -> tuple[str, str]:
     """Return the main reason of a search without grasps, and the change to try first.
 
     Args:
         result: the result without grasps.
         scene: the segmented map.
         stroke: widest opening of the hand [m].
+        samples: number of sampled surface points of the search.
     """
+    number = result.target.number
+    size = obstacle(scene.objects[number], stroke) if 0 <= number < len(scene.objects) else None
+    if size is None and samples < _USUAL_SAMPLES:
+        return f"{samples} sampled points of its surface are few", f"raise --samples, to {_USUAL_SAMPLES} or more"
     if result.doubtful:
         best = result.doubtful[0]
         why = f"{len(result.doubtful)} grasps fit the map, but the best of them {best.rejected}"
@@ -72,11 +81,8 @@ def first_change(result: GraspResult, scene: SegmentedMap, stroke: float) -> tup
         if best.rejected.startswith("has a confidence"):
             return why, "take another hand, or allow such grasps (--min-confidence)"
         return why, "map it again from more sides, or allow such grasps (--accept-implied)"
-    number = result.target.number
-    if 0 <= number < len(scene.objects):
-        size = obstacle(scene.objects[number], stroke)
-        if size is not None:
-            return size.reason, "take a hand that opens wider (`splatbot robot list`), or another target"
+    if size is not None:
+        return size.reason, "take a hand that opens wider (`splatbot robot list`), or another target"
     # Hands that only the arm rejects fit the object: that reason comes first, however few they are.
     ranked = sorted(result.rejected.items(), key=lambda pair: (not pair[0].startswith(FITTING), -pair[1]))
     for reason, count in ranked:

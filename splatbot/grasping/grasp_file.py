@@ -162,7 +162,7 @@ class GraspFile:
         """Return the grasps, or that of one rank, as the result of a search; for errors see :meth:`grasp`."""
         ranks = range(max(1, len(self.grasps))) if index is None else (index,)
         grasps = tuple(self.grasp(rank, joints) for rank in ranks)
-        return GraspResult(self.target, grasps, {}, None, len(grasps), {}, map_version=0)
+        return GraspResult(self.target, grasps, {}, None, len(grasps), {}, map_version=0, first_rank=ranks[0])
 
 
 def grasp_file(

@@ -136,7 +136,7 @@ class _Pick:
             if not found.grasps:
                 raise _EndedError(PickOutcome.NO_GRASP, NoGraspError(found).message)
             self._done(f"{len(found.grasps)} grasps of {found.candidates} hands")
-            self.left = list(enumerate(found.grasps, start=1))
+            self.left = list(enumerate(found.grasps, start=found.first_rank))
             self._try_in_turn()
         except _EndedError as end:
             return self._ended(end)

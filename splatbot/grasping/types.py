@@ -113,6 +113,7 @@ class GraspResult:
         notes: remarks on the result, each a sentence.
         doubtful: grasps that passed all tests, best first, but should not be executed. Their confidence is too small,
             or no contact is at measured depth, so that nothing measured shows an object between the fingers.
+        first_rank: rank of the first of ``grasps``, from 0; larger where they are a part of a file.
     """
 
     target: Target
@@ -124,6 +125,7 @@ class GraspResult:
     map_version: int
     notes: tuple[str, ...] = ()
     doubtful: tuple[Grasp, ...] = ()
+    first_rank: int = 0
 
     def __bool__(self) -> bool:
         return bool(self.grasps)

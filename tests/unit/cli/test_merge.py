@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -15,6 +16,7 @@ from splatbot.config import Config
 from splatbot.logs import open_log
 from splatbot.mapping.alignment import MapAlignment
 from splatbot.run import map_log
+from tests.terminal import at_a_terminal
 from tests.unit.cli.conftest import RunCommand, assert_fix_named, assert_refused
 
 HEAVY = ("torch", "open3d", "cv2", "matplotlib", "numpy")
@@ -92,6 +94,36 @@ def test_an_interrupted_merge_leaves_no_folder_and_the_same_command_then_succeed
     assert run(*words).code == 0
     assert_fix_named(run(*words), "--overwrite")
     assert run(*words, "--overwrite").code == 0
+
+
+def _files(folder: str | Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in Path(folder).rglob("*") if path.is_file()}
+
+
+def test_ctrl_c_at_a_terminal_before_the_merge_writes_keeps_the_run_that_it_would_replace(
+    runs: tuple[str, str], work_folder: Path
+) -> None:
+    shutil.copytree(runs[0], "c")
+    before = [_files(run) for run in (*runs, "c")]
+    words = ("merge", *runs, "--out", "c", "--no-report", "--overwrite")
+    shown = at_a_terminal(*words, columns=80, interrupt_at="locating B in A", cwd=work_folder)
+    assert shown.code == 130, shown.text
+    assert "Traceback" not in shown.text
+    assert [_files(run) for run in (*runs, "c")] == before
+    assert [path.name for path in Path().iterdir()] == ["c"]
+
+
+def test_ctrl_c_at_a_terminal_while_the_merged_map_is_refined_keeps_both_runs_and_saves_a_whole_one(
+    run: RunCommand, runs: tuple[str, str], work_folder: Path
+) -> None:
+    before = [_files(each) for each in runs]
+    shown = at_a_terminal("merge", *runs, "--out", "c", "--no-report", columns=80, interrupt_at="refining")
+    assert shown.code == 130, shown.text
+    assert "Traceback" not in shown.text
+    assert [_files(each) for each in runs] == before
+    assert json.loads(Path("c/metrics.json").read_text())["interrupted"]
+    assert len(Path("c/trajectory.tum").read_text().splitlines()) >= 24  # of both runs
+    assert run("info", "c").code == 0
 
 
 def test_the_json_of_aligned_runs_has_the_identity_and_the_picture(

@@ -115,6 +115,15 @@ def test_rows_of_another_number_of_gaussians_are_refused(
     assert_refused(run("plan-pick", *words), "is no file of grasps")
 
 
+@pytest.mark.long
+def test_grasps_have_the_ranks_of_the_table_and_of_grasp_index(
+    run: RunCommand, map_file: Path, grasps: Path, tmp_path: Path
+) -> None:
+    words = ("plan-pick", "--map", map_file, "--grasp", grasps, "--out", tmp_path / "out")
+    assert "grasp 0, " in run(*words).out
+    assert "grasp 2, " in run(*words, "--grasp-index", 2).out
+
+
 def test_a_rank_that_does_not_exist_is_refused(run: RunCommand, map_file: Path, grasps: Path) -> None:
     words = ("--map", map_file, "--grasp", grasps, "--grasp-index", 7)
     assert_refused(run("plan-pick", *words), "--grasp-index: is 7, of 3 grasps")

@@ -30,6 +30,13 @@ def test_a_robot_is_added_checked_listed_and_described(
     assert "has no inertias" in refused.err
 
 
+def test_every_value_of_the_description_has_its_unit(run: RunCommand) -> None:
+    info = run("robot", "info", "panda").out
+    (first,) = [line for line in info.splitlines() if "panda_joint1 " in line]
+    assert "-2.8973 .. +2.8973 rad, at most 2.175 rad/s, 15 rad/s², 87 Nm" in first  # Franka's data sheet
+    assert next(line for line in info.splitlines() if " home " in line).endswith(" rad")
+
+
 def test_the_panda_is_written_for_mujoco(run: RunCommand, tmp_path: Path) -> None:
     assert run("robot", "mjcf", "panda", "--out", tmp_path / "panda.xml").code == 0
     assert "panda_joint7" in (tmp_path / "panda.xml").read_text()

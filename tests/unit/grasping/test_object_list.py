@@ -77,6 +77,15 @@ def test_what_hangs_in_the_air_is_told_from_what_stands() -> None:
     assert [item.on_support for item in lifted] == [item.number != 0 for item in found]
 
 
+def test_a_search_of_few_samples_is_to_be_raised_before_anything_else_is_changed() -> None:
+    target = Target(scene().objects[0].rows, 0, "box", "rules", 1.0)
+    result = GraspResult(target, (), {"hands are in the target on their way": 9}, None, 9, {}, 0)
+    reason, change = first_change(result, scene(), 0.08, samples=5)
+    assert "5 sampled points" in reason
+    assert change == "raise --samples, to 400 or more"
+    assert "--approach" in first_change(result, scene(), 0.08, samples=400)[1]
+
+
 def test_flat_patches_are_no_mugs() -> None:
     patches = tuple(replace(o, size=np.array([0.09, 0.08, 0.005]), name="") for o in scene().objects)
     flat = replace(scene(), objects=patches, names=())
