@@ -103,7 +103,7 @@ class _Present(Collector):
         """Collect the metric families."""
         maps = self._store.list()
         families = {
-            "gaussians": ("Gaussians in the map", lambda m: len(m.snapshot.model) if m.snapshot else 0),
+            "gaussians": ("Gaussians in the map", lambda m: m.gaussians),
             "bytes": ("Size of the map", lambda m: m.nbytes),
             "version": ("Published states", lambda m: m.map_version),
         }

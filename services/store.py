@@ -9,9 +9,11 @@ import threading
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+from splatbot.camera import Camera
 from splatbot.collision import GaussianCollisionField
 from splatbot.errors import InputError, MapNotFoundError
-from splatbot.gaussians import Snapshot
+from splatbot.gaussians import GaussianModel, Snapshot
+from splatbot.protocols import Array
 from splatbot.results.folder import RunFolder
 from splatbot.services.bus import Bus
 from splatbot.services.camera_states import CameraStates
@@ -20,6 +22,7 @@ from splatbot.services.frames_first import FramesFirst
 from splatbot.services.problems import MapNotReadyError
 from splatbot.services.robot_mask import RobotMask
 from splatbot.services.topics import REMOVED, STATE, TRAJECTORY, map_topic
+from splatbot.tiles import TiledMap
 from splatbot.trajectory import Trajectory
 from splatbot.workspace import Workspace
 
@@ -66,6 +69,7 @@ class ServedMap:
         cameras: further cameras, while it is mapped.
         world: name of its world frame; a later map of the same name has another, a map that a restart loads the same.
         owner: client that made it, whose quota it counts in; empty if the service made it.
+        tiles: a map on disk, which has no snapshot. If None, the map is in memory.
     """
 
     id: str
@@ -83,15 +87,27 @@ class ServedMap:
     cameras: CameraStates = dataclasses.field(default_factory=CameraStates, repr=False, compare=False)
     world: str = dataclasses.field(default_factory=lambda: secrets.token_hex(8))
     owner: str = ""
+    tiles: TiledMap | None = dataclasses.field(default=None, repr=False, compare=False)
 
     @property
     def map_version(self) -> int:
-        """The state's number, 0 before the first."""
+        """The state's number, 0 before the first; 1 of a tiled map."""
+        if self.tiles is not None:
+            return 1
         return self.snapshot.map_version if self.snapshot else 0
+
+    @property
+    def gaussians(self) -> int:
+        """Number of Gaussians, 0 before the first state."""
+        if self.tiles is not None:
+            return len(self.tiles)
+        return len(self.snapshot.model) if self.snapshot else 0
 
     @property
     def nbytes(self) -> int:
         """Memory of the Gaussians [bytes]."""
+        if self.tiles is not None:
+            return self.tiles.nbytes
         return self.snapshot.model.nbytes if self.snapshot else 0
 
     @property
@@ -99,8 +115,12 @@ class ServedMap:
         """The snapshot.
 
         Raises:
+            InputError: the map is tiled.
             MapNotReadyError: nothing is published yet.
         """
+        if self.tiles is not None:
+            hint = "request its views, distances or collisions; or serve the map that it was made of"
+            raise InputError("is tiled, and this needs the whole map.", field=f"map {self.id!r}", hint=hint)
         if self.snapshot is None:
             because = f" because mapping failed: {self.detail}" if self.state == "failed" else " yet"
             raise MapNotReadyError(f"Map {self.id!r} has no state{because}.", hint="see GET /v1/maps for its progress")
@@ -111,9 +131,26 @@ class ServedMap:
         """The collision field of this state, built by the first question.
 
         Raises:
+            InputError: the map is tiled.
             MapNotReadyError: nothing is published yet.
         """
         return self.derived.get("field", lambda: GaussianCollisionField(self.ready))
+
+    def overview(self) -> GaussianModel:
+        """Return the Gaussians, or the coarsest ones of a tiled map.
+
+        Raises:
+            MapNotReadyError: nothing is published yet.
+        """
+        return self.ready.model if self.tiles is None else self.tiles.overview()
+
+    def in_view(self, camera: Camera, T_world_camera: Array) -> GaussianModel:
+        """Return the Gaussians that draw a view.
+
+        Raises:
+            MapNotReadyError: nothing is published yet.
+        """
+        return self.ready.model if self.tiles is None else self.tiles.in_view(camera, T_world_camera).model
 
 
 class MapStore:
@@ -148,6 +185,7 @@ class MapStore:
         counted: bool = True,
         world: str | None = None,
         owner: str = "",
+        tiles: TiledMap | None = None,
     ) -> ServedMap:
         """Serve a map under a new name. Saved maps that return at a start are not ``counted``: all of them return.
 
@@ -179,6 +217,7 @@ class MapStore:
                 generation=next(self._generations),
                 world=world or secrets.token_hex(8),
                 owner=owner,
+                tiles=tiles,
             )
             self._put(served)
         return served

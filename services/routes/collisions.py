@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
+import numpy as np
 from fastapi import APIRouter, Depends, Request, Response
+from numpy.typing import NDArray
 
+from splatbot.collision import RobotSpheres
 from splatbot.services.codecs import answer, answers, body_of, request_body
 from splatbot.services.dependencies import ServedAfterFrames, Settings, problems
 from splatbot.services.problems import TooLargeError
 from splatbot.services.robots_in_maps import arm_in
 from splatbot.services.schemas import BASE_EXAMPLE, CollisionsRequest
+from splatbot.tiles import TiledField, TiledMap
 
 router = APIRouter(prefix="/v1/maps", tags=["collision"])
 
@@ -34,6 +38,7 @@ _ANSWER = {
     "gaussian": [977],
     "gradient": [[0.0, -0.02, 0.0, 0.1, 0.0, 0.05, 0.0]],
 }
+_REACH = 1.0  # [m] farther clearances are unknown in a tiled map
 _VALUES_A_ROW = 20  # its list and up to 15 joints
 _Body = Annotated[
     CollisionsRequest,
@@ -51,23 +56,32 @@ def collisions(request: Request, served: ServedAfterFrames, settings: Settings, 
     """Check each configuration: verdict, colliding link, its partner (`other`; -1 is the map), and clearance.
 
     "No" is certain for the map's ellipsoids at two standard deviations. `clearance` is the least distance [m] of the
-    arm's spheres from them, beyond the margin; null where the map is empty.
+    arm's spheres from them, beyond the margin; null where the map is empty. It is null beyond 1 m from a
+    tiled map, too.
     """
     if len(query.q) > settings.max_configurations:
         hint = "split the request, or raise SPLATBOT_MAX_CONFIGURATIONS"
         raise TooLargeError(f"has more than {settings.max_configurations} rows.", field="q", hint=hint)
     _, arm = arm_in(served, query.robot, query.base, query.margin, query.opening)
-    field = served.field
-    verdict, clearance = arm.check(field, query.q), arm.clearance(field, query.q)
+    tiled = None if served.tiles is None else _field_around(served.tiles, arm, query.q)
+    field, cut = (served.field, np.inf) if tiled is None else (tiled.field, tiled.reach)
+    verdict, clearance = arm.check(field, query.q), arm.clearance(field, query.q, cut=cut)
     body: dict[str, Any] = {
-        "map_version": verdict.map_version,
+        "map_version": served.map_version,
         "in_collision": verdict.in_collision,
         "link": verdict.link,
         "other": verdict.other,
         "clearance": clearance.distance,
         "clearance_link": clearance.link,
-        "gaussian": clearance.index,
+        "gaussian": clearance.index if tiled is None else tiled.rows_of(clearance.index),
     }
     if query.gradient:
         body["gradient"] = clearance.gradient
     return answer(request, body, array="in_collision")
+
+
+def _field_around(tiles: TiledMap, arm: RobotSpheres, q: NDArray[np.float64]) -> TiledField:
+    """Return the field of a box that holds all spheres of an arm at configurations (C, J)."""
+    centres = arm.centers(q).reshape(-1, 3) if len(q) else np.zeros((1, 3))
+    room = float(arm.spheres.radii.max()) + arm.margin
+    return tiles.field(centres.min(axis=0) - room, centres.max(axis=0) + room, reach=_REACH)

@@ -6,11 +6,14 @@ from typing import Annotated
 
 import numpy as np
 from fastapi import APIRouter, Depends, Request, Response
+from numpy.typing import NDArray
 
+from splatbot.collision import MahalanobisResult
 from splatbot.services.codecs import answer, answers, body_of, request_body
 from splatbot.services.dependencies import ServedAfterFrames, Settings, problems
 from splatbot.services.problems import TooLargeError
 from splatbot.services.schemas import DistanceRequest
+from splatbot.services.store import ServedMap
 
 router = APIRouter(prefix="/v1/maps", tags=["collision"])
 
@@ -27,6 +30,7 @@ _ANSWER = {
     "inside": [True, False],
 }
 _CUT = 1.0  # [m] farther distances are infinite, which saves most of their time
+_N_SIGMA = 2.0  # of motions
 _VALUES_A_POINT = 8  # its list and three numbers
 _Body = Annotated[
     DistanceRequest,
@@ -45,7 +49,8 @@ def distance(request: Request, served: ServedAfterFrames, settings: Settings, qu
 
     `distance_sigma` is the Mahalanobis distance to the Gaussian `index`. `distance_m` is the signed distance to the
     surface at `n_sigma` standard deviations. It is null beyond 1 m, and for another `n_sigma` than that of motions, 2.
-    In an empty map both are null (infinity in npy and msgpack) and the index is -1.
+    In an empty map both are null (infinity in npy and msgpack) and the index is -1. So are `distance_sigma` and `index`
+    of a tiled map where `distance_sigma` would exceed `n_sigma`.
     """
     if len(query.points) > settings.max_points:
         raise TooLargeError(
@@ -54,13 +59,10 @@ def distance(request: Request, served: ServedAfterFrames, settings: Settings, qu
             hint="split the request, or raise SPLATBOT_MAX_POINTS",
         )
     points = query.points.reshape(-1, 3)
-    found = served.field.mahalanobis(points)
-    metres = np.full(len(points), np.inf, np.float32)
-    if query.n_sigma == served.field.n_sigma:
-        metres = served.field.clearance(points, cut=_CUT).distance.astype(np.float32)
-        metres[metres >= _CUT] = np.inf
+    found, metres = _nearest(served, points, query.n_sigma)
+    metres[metres >= _CUT] = np.inf
     body = {
-        "map_version": found.map_version,
+        "map_version": served.map_version,
         "n_sigma": query.n_sigma,
         "distance_sigma": found.distance,
         "distance_m": metres,
@@ -68,3 +70,20 @@ def distance(request: Request, served: ServedAfterFrames, settings: Settings, qu
         "inside": found.distance.astype(np.float64) <= query.n_sigma,
     }
     return answer(request, body, array="distance_sigma")
+
+
+def _nearest(
+    served: ServedMap, points: NDArray[np.float64], n_sigma: float
+) -> tuple[MahalanobisResult, NDArray[np.float32]]:
+    """Return the nearest Gaussians, and the distances (P,) [m] at the standard deviations of motions, or infinity."""
+    unknown = np.full(len(points), np.inf, np.float32)
+    if served.tiles is None:
+        found = served.field.mahalanobis(points)
+        if n_sigma != _N_SIGMA:
+            return found, unknown
+        return found, served.field.clearance(points, cut=_CUT).distance.astype(np.float32)
+    around = points if len(points) else np.zeros((1, 3))
+    field = served.tiles.field(around.min(axis=0), around.max(axis=0), n_sigma, reach=_CUT)
+    if n_sigma != _N_SIGMA:
+        return field.mahalanobis(points), unknown
+    return field.mahalanobis(points), field.clearance(points).distance.astype(np.float32)

@@ -42,12 +42,12 @@ async def landing(service: Service) -> HTMLResponse:
     if not maps:
         shown = "<p>There is no map yet.</p>"
     else:
-        rows = "".join(_row(m.id, m.state, len(m.snapshot.model) if m.snapshot else 0) for m in maps)
+        rows = "".join(_row(m.id, m.state, m.gaussians) for m in maps)
         shown = (
             '<div class="scroll"><table><tr><th>map</th><th>state</th><th>Gaussians</th><th></th></tr>'
             f"{rows}</table></div>"
         )
-        shown += _picture(maps[0].id) if maps[0].snapshot is not None else ""
+        shown += _picture(maps[0].id) if maps[0].map_version else ""
     port = service.settings.viewer_port
     viewer = f"<li>viewer in 3D: port {port} of this machine; it asks for the key</li>" if port else ""
     state = "ending" if service.draining else "ready"

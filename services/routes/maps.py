@@ -104,6 +104,7 @@ _CREATE = {
     },
 }
 _FILE: dict[int | str, dict[str, Any]] = {200: {"content": {"application/octet-stream": {}}, "description": "the file"}}
+_Corner = tuple[float, float, float]
 _FormatName = Annotated[str, Path(description=f"one of {', '.join(WRITTEN)}", examples=["ply"])]
 
 
@@ -295,24 +296,32 @@ def _forget(service: Service, served: ServedMap, scratch: Scratch | None = None)
 
 def _info(served: ServedMap) -> MapInfo:
     snapshot = served.snapshot
-    bounds = None
-    if snapshot is not None and len(snapshot.model):
-        low, high = snapshot.model.means.aminmax(dim=0)
-        bounds = Bounds(low=tuple(low.tolist()), high=tuple(high.tolist()))
+    box = _box(served)
     return MapInfo(
         id=served.id,
         map_version=served.map_version,
         state=served.state,
         detail=served.detail,
         source=served.source,
-        gaussians=len(snapshot.model) if snapshot else 0,
+        gaussians=served.gaussians,
         bytes=served.nbytes,
-        sh_degree=snapshot.model.sh_degree if snapshot else 0,
+        sh_degree=served.overview().sh_degree if served.map_version else 0,
         stamp=snapshot.stamp if snapshot else 0.0,
-        bounds=bounds,
+        bounds=None if box is None else Bounds(low=box[0], high=box[1]),
         robot=None if served.mask is None else _masked(served.mask),
         cameras={name: _camera_info(served, name, state) for name, state in served.cameras.by_name.items()},
     )
+
+
+def _box(served: ServedMap) -> tuple[_Corner, _Corner] | None:
+    """Return the corners of the box of all means [m]. If None, there are no Gaussians."""
+    if not served.gaussians:
+        return None
+    if served.tiles is not None:
+        low, high = served.tiles.box
+    else:
+        low, high = served.ready.model.means.numpy().min(axis=0), served.ready.model.means.numpy().max(axis=0)
+    return tuple(low.tolist()), tuple(high.tolist())
 
 
 def _camera_info(served: ServedMap, name: str, state: Mapping[str, Any]) -> FurtherCameraInfo:

@@ -59,7 +59,7 @@ def render_default(
     tag = etag(served, f"{mode} {width} {height} {fov_deg}")
     if (kept := unchanged(request, served, tag)) is not None:
         return kept
-    camera, pose = default_view(served.ready.model, width=width, height=height, fov_deg=fov_deg)
+    camera, pose = default_view(served.overview(), width=width, height=height, fov_deg=fov_deg)
     return _png(served, tag, camera, pose, mode, None)
 
 
@@ -71,7 +71,7 @@ def render_default(
 )
 def render(served: ServedAfterFrames, settings: Settings, request: _Body) -> Response:
     """Render the map for a given camera and pose."""
-    model = served.ready.model
+    model = served.overview()
     if request.camera is not None:
         check_size(request.camera.width, request.camera.height, settings)
         camera = Camera(**request.camera.model_dump())
@@ -94,7 +94,7 @@ def _png(
     mode: Mode,
     depth_range: tuple[float, float] | None,
 ) -> Response:
-    view = render_view(served.ready.model, camera, T_world_camera, mode)
+    view = render_view(served.in_view(camera, T_world_camera), camera, T_world_camera, mode)
     headers = version_headers(served, tag)
     if mode == "depth":
         depth_range = depth_range or depth_limits(view)

@@ -56,9 +56,10 @@ def views(request: Request, served: ServedAfterFrames, settings: Settings, query
     for number, view in enumerate(query.views):
         check_size(view.camera.width, view.camera.height, settings)
         camera, pose = Camera(**view.camera.model_dump()), view.pose.matrix(f"views.{number}.pose")
+        model = served.in_view(camera, pose)
         images: dict[str, Any] = {}
         for mode in query.modes:
-            image = render_view(served.ready.model, camera, pose, mode)
+            image = render_view(model, camera, pose, mode)
             if as_arrays:
                 images[mode] = (255.0 * image + 0.5).astype(np.uint8) if mode == "rgb" else image
             else:

@@ -12,7 +12,7 @@ import tyro
 from splatbot.cli.paths import check_camera, check_file, check_output
 from splatbot.cli.placing import named_robot
 from splatbot.errors import InputError
-from splatbot.layouts import REPLAY, is_camera, log_kind, map_file
+from splatbot.layouts import REPLAY, is_camera, is_tiled_map, log_kind, map_file
 
 if TYPE_CHECKING:
     from splatbot.robots.controllers.ros import RosController
@@ -60,7 +60,7 @@ def serve(
     http://localhost:8000/v1/maps/default/render shows the map. Every setting is a variable SPLATBOT_NAME, too.
 
     Args:
-        map: a map file, or a run folder that holds map.ply.
+        map: a map file, a run folder that holds map.ply, or a tiled map (views, distances and collisions alone).
         log: a log that is mapped while the service runs; the answers follow the map's latest state.
         data: folder that maps made by clients are kept in and served from again, or SPLATBOT_DATA_DIR.
         camera: a camera that is mapped while the service runs (replay:LOG plays a recording in real time); or, with
@@ -88,7 +88,7 @@ def serve(
         return _print_new_key(scopes)
     if scopes is not None:
         raise InputError("is for a new key.", field="--scopes", hint="give --new-key, too")
-    if map is not None:
+    if map is not None and not is_tiled_map(map):
         map_file(map)
     if log is not None:
         log_kind(log)
@@ -159,6 +159,12 @@ def _connect_arm(runtime: Runtime, address: str) -> RosController | UrController
 
 
 def _add_map(runtime: Runtime, map_: Path) -> None:
+    if is_tiled_map(map_):
+        from splatbot.tiles import TiledMap
+
+        tiles = TiledMap(map_, memory_mb=runtime.settings.tiles_mb)
+        runtime.store.add(MAP_ID, source=map_.name, state="static", awaited=False, tiles=tiles)
+        return
     from splatbot.gaussians import GaussianModel, Snapshot
     from splatbot.robots.graspable_objects import run_of
     from splatbot.workspace import find_workspace

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from splatbot.collision import ClearanceResult, GaussianCollisionField
+from splatbot.collision import ClearanceResult, GaussianCollisionField, MahalanobisResult
 from splatbot.collision.inputs import as_float64, spheres
 from splatbot.errors import InputError
 from splatbot.protocols import Array
@@ -48,7 +48,25 @@ class TiledField:
         """
         self.check_inside(points)
         found = self.field.clearance(points, cut=self.reach)
-        return replace(found, index=np.append(self.rows, -1)[found.index].astype(np.int64))
+        return replace(found, index=self.rows_of(found.index))
+
+    def mahalanobis(self, points: ArrayLike | Tensor) -> MahalanobisResult:
+        """Find the nearest Gaussian of each of ``points`` (P, 3) inside the box by Mahalanobis distance.
+
+        A distance above the field's ``n_sigma`` is infinite, with the index -1: the nearest Gaussian may be elsewhere.
+
+        Raises:
+            InputError: they are invalid, or not inside the box.
+        """
+        self.check_inside(points)
+        found = self.field.mahalanobis(points)
+        known = found.distance <= self.field.n_sigma
+        distance = np.where(known, found.distance, np.float32(np.inf))
+        return replace(found, distance=distance, index=np.where(known, self.rows_of(found.index), -1))
+
+    def rows_of(self, index: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Map rows of the field to rows of the map; -1 stays -1."""
+        return np.append(self.rows, -1)[index].astype(np.int64)
 
     def check_inside(self, points: ArrayLike | Tensor) -> None:
         """Check that points (P, 3) or spheres (P, 4) are inside the box.

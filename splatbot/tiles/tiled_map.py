@@ -130,6 +130,11 @@ class TiledMap:
         with self._lock:
             return sum(part.nbytes for part in self._cache.values())
 
+    @property
+    def box(self) -> tuple[Array, Array]:
+        """Corners (3,) of the box of all means [m, world]; of a map with Gaussians."""
+        return self._low[self._leaves].min(axis=0), self._high[self._leaves].max(axis=0)
+
     def overview(self) -> GaussianModel:
         """Return the Gaussians of the coarsest level."""
         root = len(self.index.tiles) - 1
