@@ -79,19 +79,34 @@ def _print(found: tuple[ListedObject, ...], planes: list[dict[str, Any]]) -> Non
         chosen = [item for item in found if item.on_support == on_support]
         if not chosen:
             continue
-        table = Table("object", "label", "size, mm", "at, m from the base", "hand", title=title, title_justify="left")
+        table = Table("no.", "label", "size, mm", "at, m", "hand", "reach", title=title, title_justify="left")
         for item in chosen:
-            size = " x ".join(f"{1e3 * x:.0f}" for x in item.size)
+            size = "×".join(f"{1e3 * x:.0f}" for x in item.size)
             at = " ".join(f"{x:.2f}" for x in item.at_base)
-            table.add_row(str(item.number), item.label, size, at, item.verdict)
+            table.add_row(str(item.number), item.label, size, at, *_verdicts(item))
         print_columns(table)
-    for verdict in dict.fromkeys(item.verdict for item in found if item.obstacle):
+    print_text("at: the middle of the object from the base; size: long side, short side, height")
+    for verdict in dict.fromkeys(word for item in found for word in _verdicts(item) if word in _MEANINGS):
         print_text(f"{verdict}: {_MEANINGS[verdict]}")
 
 
+def _verdicts(item: ListedObject) -> tuple[str, str]:
+    """Return the words for the hand and for the arm."""
+    if item.within_reach is None:
+        return item.verdict, "-"
+    of_hand = "fits" if item.fits else item.verdict
+    if item.within_reach:
+        return of_hand, "yes"
+    return of_hand, item.verdict if item.fits else "no"
+
+
 _MEANINGS = {
+    "fits": "the hand encloses it by its size; splatbot grasp also checks its sides and surroundings",
+    "yes": "a posture of the arm takes the tool to its centre; obstacles are not checked",
+    "no": "beyond the arm, or no posture; --json has the reason of the hand",
     "no hand": "the robot has no hand; --robot takes one that has",
     "too flat": "lower than 12 mm, so that no hand encloses it",
     "too wide": "its faces are farther apart than the hand opens, less 2 mm at each pad",
+    "no pose": "no posture of the arm takes the tool to its centre from above, the front or a side",
     "too far": "beyond the reach of the arm from this base; --json has the distances",
 }

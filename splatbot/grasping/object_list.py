@@ -11,6 +11,7 @@ from splatbot.geometry import inverse, transform_points
 from splatbot.grasping.hands import CONSTANTS as HANDS
 from splatbot.grasping.hands import usable_opening
 from splatbot.grasping.language import label_of
+from splatbot.planning.ik import ArmWithTool, solve_ik
 from splatbot.protocols import Array, HasHand, RobotKinematics
 from splatbot.segmentation import MapObject, SegmentedMap
 from splatbot.segmentation.plane import NEAR
@@ -24,10 +25,12 @@ class ObjectListConstants:
         min_height: [m] height below which an object is a flat patch, which a hand cannot enclose.
         max_gap: [m] largest height of an object's lowest points above the support that it stands on. Undersides are
             seldom seen.
+        ik_starts: number of starts of inverse kinematics for one pose of the tool.
     """
 
     min_height: float = 0.012
     max_gap: float = 0.03
+    ik_starts: int = 64
 
 
 CONSTANTS = ObjectListConstants()
@@ -57,8 +60,10 @@ class ListedObject:
         at_world, at_base: (3,) centre of the bounding box [m].
         gaussians: number of Gaussians.
         fits: whether the hand can enclose it.
+        within_reach: whether a posture of the arm places the tool at its centre, without regard to obstacles. If None,
+            the robot has no hand.
         on_support: whether it stands on a support of the map, and does not float or hang.
-        verdict: "fits", or the obstacle in two words: "no hand", "too flat", "too wide" or "too far".
+        verdict: "fits", or the obstacle in two words: "no hand", "too flat", "too wide", "too far" or "no pose".
         obstacle: reason why the hand cannot enclose it or the arm cannot reach it, or "".
     """
 
@@ -69,6 +74,7 @@ class ListedObject:
     at_base: Array = field(repr=False)
     gaussians: int = 0
     fits: bool = True
+    within_reach: bool | None = None
     on_support: bool = True
     verdict: str = "fits"
     obstacle: str = ""
@@ -85,6 +91,7 @@ class ListedObject:
             "gaussians": self.gaussians,
             "on_support": self.on_support,
             "graspable_by_size": self.fits,
+            "within_reach": self.within_reach,
             "verdict": self.verdict,
             "obstacle": self.obstacle or None,
         }
@@ -101,7 +108,8 @@ def list_objects(scene: SegmentedMap, robot: RobotKinematics) -> tuple[ListedObj
     found = []
     for item in scene.objects:
         at, by_size = transform_points(T_base_world, item.center), obstacle(item, stroke)
-        limit = by_size or _too_far(at, float(np.linalg.norm(item.size)) / 2, robot)
+        beyond = _out_of_reach(at, float(np.linalg.norm(item.size)) / 2, robot)
+        limit = by_size or beyond
         found.append(
             ListedObject(
                 item.number,
@@ -111,6 +119,7 @@ def list_objects(scene: SegmentedMap, robot: RobotKinematics) -> tuple[ListedObj
                 at,
                 len(item.rows),
                 fits=by_size is None,
+                within_reach=None if stroke <= 0.0 else beyond is None,
                 on_support=_stands(scene, item),
                 verdict=limit.verdict if limit else "fits",
                 obstacle=limit.reason if limit else "",
@@ -150,18 +159,35 @@ def _stands(scene: SegmentedMap, item: MapObject) -> bool:
     return support is not None and float(np.percentile(support.height(points), 5)) <= CONSTANTS.max_gap
 
 
-def _too_far(center: Array, radius: float, robot: RobotKinematics) -> Obstacle | None:
-    """Return why an arm cannot reach a ball around a point (3,) [m, base frame], or None.
+def _out_of_reach(center: Array, radius: float, robot: RobotKinematics) -> Obstacle | None:
+    """Return why an arm cannot reach an object with a center (3,) [m, base frame] and a radius [m], or None.
 
-    The tool is at most as far from the first joint as all links in line, which the postures of a grasp are not.
+    The tool is at most as far from the first joint as all links in line. Nearer objects need a posture that places the
+    tool at the centre, with an approach from above, from the front or from a side.
     """
-    if not isinstance(robot, HasHand):
+    if not isinstance(robot, ArmWithTool):
         return None
     reach = robot.chain.reach(robot.T_link_tcp)
     away = float(np.linalg.norm(center - robot.chain.T_before_joint[0, :3, 3])) - radius
-    if away <= reach:
+    if away > reach:
+        return Obstacle("too far", f"it is {away:.2f} m from the first joint, and the arm reaches {reach:.2f} m")
+    if any(len(solve_ik(robot, T, seeds=16, most=CONSTANTS.ik_starts).q) for T in _approaches(center)):
         return None
-    return Obstacle("too far", f"it is {away:.2f} m from the first joint, and the arm reaches {reach:.2f} m")
+    return Obstacle("no pose", "no posture places the tool at its centre from above, from the front or from a side")
+
+
+def _approaches(center: Array) -> list[Array]:
+    """Return tool poses (4, 4) at a point (3,): from above, front and sides, with fingers closing in two directions."""
+    away = np.array([center[0], center[1], 0.0])
+    front = away / np.linalg.norm(away) if np.linalg.norm(away) > 0.0 else np.array([1.0, 0.0, 0.0])
+    down, side = np.array([0.0, 0.0, -1.0]), np.array([-front[1], front[0], 0.0])
+    poses = []
+    for z, y in ((down, side), (down, front), (front, side), (front, down), (side, front), (side, down), (-side, down)):
+        T = np.eye(4)
+        T[:3, :3] = np.stack([np.cross(y, z), y, z], axis=1)
+        T[:3, 3] = center
+        poses.append(T)
+    return poses
 
 
 def obstacle(item: MapObject, stroke: float) -> Obstacle | None:

@@ -48,6 +48,7 @@ class HasTool(Protocol):
         ...
 
 
+@runtime_checkable
 class ArmWithTool(HasTool, Protocol):
     """An arm for :func:`solve_ik`."""
 
@@ -154,12 +155,13 @@ def solve_ik(
     seed: int = 0,
     free: CollisionFilter | None = None,
     apart: float = 0.05,
+    most: int = CONSTANTS.max_starts,
 ) -> IkSolutions:
     """Return the distinct configurations found that place the tool at ``T_base_tcp`` to ``CONSTANTS.max_error``.
 
     The starts are ``near``, the home posture and uniformly random configurations. While none of them gives a
-    free solution, further random starts follow, up to 512 in total. With ``seeds=1`` only ``near`` is solved, so that a
-    sequence of calls follows one branch of solutions. Equal arguments give equal solutions. Joints that can turn
+    free solution, further random starts follow, up to ``most`` in total. With ``seeds=1`` only ``near`` is solved, so
+    that a sequence of calls follows one branch of solutions. Equal arguments give equal solutions. Joints that can turn
     further than once take the turn nearest to ``near``.
 
     Args:
@@ -170,6 +172,7 @@ def solve_ik(
         seed: seed of the random starts.
         free: filter that maps configurations (K, J) to (K,). If None, collisions are not checked.
         apart: distance in the largest joint difference [rad or m] below which two solutions count as one.
+        most: largest number of starts.
 
     Raises:
         InputError: the pose is not rigid, or ``near`` does not fit the robot.
@@ -184,8 +187,8 @@ def solve_ik(
     starts = np.concatenate([fixed, _random(chain, max(0, seeds - len(fixed)), rng)])[:seeds]
     q, tried = nearest_turns(_solutions(robot, T, starts), posture, chain), len(starts)
     kept = _distinct(q, posture, apart, free)
-    while seeds > 1 and not len(kept) and tried < CONSTANTS.max_starts:
-        starts = _random(chain, min(seeds, CONSTANTS.max_starts - tried), rng)
+    while seeds > 1 and not len(kept) and tried < most:
+        starts = _random(chain, min(seeds, most - tried), rng)
         more = nearest_turns(_solutions(robot, T, starts), posture, chain)
         q, tried = np.concatenate([q, more]), tried + len(starts)
         kept = _distinct(q, posture, apart, free)

@@ -30,7 +30,7 @@ class AnnotationConstants:
     row: int = 22
     font: float = 0.5
     dim: float = 0.25
-    badge: tuple[int, int] = (28, 20)
+    badge: tuple[int, int] = (34, 26)
     turns: int = 2000
     ring: int = 14
     bars: tuple[float, ...] = (1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01)
@@ -48,15 +48,21 @@ def with_legend(image: NDArray[np.float32], rows: Sequence[tuple[str, Color]]) -
     fits = max((image.shape[0] - 14) // CONSTANTS.row, 1)
     if len(rows) > fits:
         rows = [*rows[: fits - 1], (f"and {len(rows) - fits + 1} more", (0.5, 0.5, 0.5))]
-    width = max((cv2.getTextSize(name, _FONT, CONSTANTS.font, 1)[0][0] for name, _ in rows), default=0) + 58
+    width, height = legend_size(rows)
     marked = _bytes(image)
-    corner = marked[: CONSTANTS.row * len(rows) + 14, :width]
+    corner = marked[:height, :width]
     corner[:] = (CONSTANTS.dim * corner).astype(np.uint8)
     for number, (name, color) in enumerate(rows):
         y = 24 + CONSTANTS.row * number
         cv2.line(marked, (14, y - 5), (38, y - 5), _shade(color), 5, cv2.LINE_AA)
         cv2.putText(marked, name, (46, y), _FONT, CONSTANTS.font, _LIGHT, 1, cv2.LINE_AA)
     return _floats(marked)
+
+
+def legend_size(rows: Sequence[tuple[str, Color]]) -> tuple[int, int]:
+    """Return the width and height [px] of a legend."""
+    width = max((cv2.getTextSize(name, _FONT, CONSTANTS.font, 1)[0][0] for name, _ in rows), default=0) + 58
+    return width, CONSTANTS.row * len(rows) + 14
 
 
 def with_scale(image: NDArray[np.float32], camera: Camera, depth: float, where: str) -> NDArray[np.float32]:
@@ -85,11 +91,18 @@ def with_ring(image: NDArray[np.float32], place: tuple[float, float], color: Col
 
 
 def with_numbers(
-    image: NDArray[np.float32], places: Mapping[int, Array], colors: Mapping[int, Color]
+    image: NDArray[np.float32],
+    places: Mapping[int, Array],
+    colors: Mapping[int, Color],
+    *,
+    free_of: tuple[int, int] = (0, 0),
 ) -> NDArray[np.float32]:
-    """Return an image (H, W, 3) in 0..1 with numbers at places (2,) [px]; crowded ones move aside, on a line."""
+    """Return an image (H, W, 3) in 0..1 with numbers at places (2,) [px]; crowded ones move aside, on a line.
+
+    No number is in the upper left corner of the size ``free_of`` [px], which a legend covers.
+    """
     marked = _bytes(image)
-    apart = _apart(places, np.array([image.shape[1], image.shape[0]]))
+    apart = _apart(places, np.array([image.shape[1], image.shape[0]]), np.array(free_of))
     for number, at in apart.items():
         if np.abs(at - places[number]).max() > 1:
             ends = [tuple(int(x) for x in end.round()) for end in (places[number], at)]
@@ -103,8 +116,14 @@ def with_numbers(
     return _floats(marked)
 
 
-def _apart(places: Mapping[int, Array], size: Array) -> dict[int, Array]:
-    """Return places [px] with the distance of a badge between them, each the first free one on a spiral."""
+def _apart(places: Mapping[int, Array], size: Array, corner: Array) -> dict[int, Array]:
+    """Return places [px] with the distance of a badge between them, each the first free one on a spiral.
+
+    Args:
+        places: wanted places (2,) [px]; those outside of the picture are left out.
+        size: (2,) of the picture [px].
+        corner: (2,) size of the upper left corner that stays free [px].
+    """
     step = np.arange(CONSTANTS.turns)
     angle, radius = 2.4 * step, 4.0 * np.sqrt(step)  # golden angle
     spiral = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
@@ -116,6 +135,7 @@ def _apart(places: Mapping[int, Array], size: Array) -> dict[int, Array]:
         tried = np.clip(place + spiral, badge / 2 + 2, size - badge / 2 - 2)
         others = np.array(list(taken.values())).reshape(-1, 2)
         free = (np.abs(tried[:, None] - others) >= badge).any(axis=2).all(axis=1)
+        free &= (tried >= corner + badge / 2).any(axis=1)
         taken[number] = tried[int(np.argmax(free))]
     return taken
 

@@ -14,7 +14,7 @@ from splatbot.gaussians.harmonics import rgb_to_sh
 from splatbot.geometry import inverse, look_at, transform_points
 from splatbot.grasping.object_list import ListedObject
 from splatbot.rasterize.views import render_view, to_png
-from splatbot.report.annotations import with_legend, with_numbers, with_scale
+from splatbot.report.annotations import legend_size, with_legend, with_numbers, with_scale
 from splatbot.report.robot_drawing import BACKGROUND
 from splatbot.segmentation import SegmentedMap
 
@@ -28,19 +28,31 @@ class ObjectsViewConstants:
         direction: direction from the objects to the camera, in the base frame.
         distance: distance of the camera, relative to the radius of the objects.
         min_radius: [m] least radius that the picture shows.
+        min_size: [m] longest side below which a piece is not drawn.
     """
 
     tint: float = 0.5
     direction: tuple[float, float, float] = (-0.75, 0.35, 0.75)
     distance: float = 2.6
     min_radius: float = 0.2
+    min_size: float = 0.04
 
 
 CONSTANTS = ObjectsViewConstants()
+_LEFT_OUT = "{} pieces on no support or below {:.0f} mm are only in the list"
 
 
 def objects_png(scene: SegmentedMap, found: Sequence[ListedObject], *, width: int = 1280, height: int = 800) -> bytes:
-    """Render the map obliquely from above, each object numbered in its own hue; a legend gives labels and sizes."""
+    """Render the map obliquely from above, each object numbered in its own hue; a legend gives labels and sizes.
+
+    Fragments are left out: pieces below 4 cm, and those on no support if another piece stands on one.
+
+    Args:
+        scene: the segmented map.
+        found: its objects.
+        width, height: of the picture [px].
+    """
+    listed, found = len(found), drawn_objects(found)
     model = scene.model.clone()
     for item in found:
         index = torch.from_numpy(scene.objects[item.number].rows)
@@ -63,9 +75,18 @@ def objects_png(scene: SegmentedMap, found: Sequence[ListedObject], *, width: in
         for n, (x, y, z) in seen.items()
         if z > 0
     }
-    image = with_numbers(image, places, hues)
-    image = with_legend(image, [(_described(item), hues[item.number]) for item in found])
+    rows = [(_described(item), hues[item.number]) for item in found]
+    if len(found) < listed:
+        rows.append((_LEFT_OUT.format(listed - len(found), 1e3 * CONSTANTS.min_size), (0.5, 0.5, 0.5)))
+    image = with_numbers(image, places, hues, free_of=legend_size(rows))
+    image = with_legend(image, rows)
     return to_png(with_scale(image, camera, CONSTANTS.distance * radius, "in the middle"), "rgb")
+
+
+def drawn_objects(found: Sequence[ListedObject]) -> list[ListedObject]:
+    """Return the objects that the picture shows: those on a support, or all without a support; none below 4 cm."""
+    standing = [item for item in found if item.on_support] or list(found)
+    return [item for item in standing if item.size.max() >= CONSTANTS.min_size]
 
 
 def _described(item: ListedObject) -> str:

@@ -13,6 +13,7 @@ from splatbot.grasping.language import LanguageAffordance
 from splatbot.grasping.object_list import list_objects, list_planes, obstacle
 from splatbot.grasping.types import GraspResult
 from splatbot.robots.panda import panda
+from splatbot.robots.store import load_robot
 from tests.unit.grasping.objects import BOX, OBJECTS, scene, target_of
 
 
@@ -41,6 +42,22 @@ def test_an_object_beyond_the_arm_is_listed_with_its_distance() -> None:
     assert all("from the first joint, and the arm reaches" in item.obstacle for item in fitting)
     assert {item.verdict for item in fitting} == {"too far"}
     assert not any("reaches" in item.obstacle for item in list_objects(near, panda()))
+
+
+def test_reach_is_that_of_postures_and_not_of_the_size() -> None:
+    near = scene()
+    for item in list_objects(near, panda()):
+        assert item.within_reach
+        assert item.fits == (item.verdict == "fits")
+    T = near.T_world_base.copy()
+    T[0, 3] -= (
+        0.5  # the middle of an object is 1.0 m away: nearer than all links in line, but too far for a turned hand
+    )
+    far = list_objects(replace(near, T_world_base=T), panda())
+    assert not any(item.within_reach for item in far)
+    assert {item.verdict for item in far if item.fits} == {"no pose", "too far"}
+    assert [item.fits for item in far] == [item.fits for item in list_objects(near, panda())]
+    assert all(item.within_reach is None for item in list_objects(near, load_robot("ur5e")))  # it has no hand
 
 
 def test_planes_name_height_and_size() -> None:
@@ -78,7 +95,7 @@ def test_what_hangs_in_the_air_is_told_from_what_stands() -> None:
 
 
 def test_a_search_of_few_samples_is_to_be_raised_before_anything_else_is_changed() -> None:
-    target = Target(scene().objects[0].rows, 0, "box", "rules", 1.0)
+    target = Target(scene().objects[0].rows, None, "box", "rules", 1.0)
     result = GraspResult(target, (), {"hands are in the target on their way": 9}, None, 9, {}, 0)
     reason, change = first_change(result, scene(), 0.08, samples=5)
     assert "5 sampled points" in reason

@@ -20,16 +20,17 @@ def test_crowded_numbers_move_apart_and_stay_in_the_picture() -> None:
     rng = np.random.default_rng(0)
     places = {k: np.array([300.0, 200.0]) + rng.normal(0, 6, 2) for k in range(40)}
     places[40] = np.array([1.0, 479.0])
-    found = _apart(places, np.array([640, 480]))
+    found = _apart(places, np.array([640, 480]), np.array([290, 300]))
     at = np.array(list(found.values()))
     away = np.abs(at[:, None] - at)
     clear = (away >= np.array(CONSTANTS.badge) - 1e-9).any(axis=2)
     assert (clear | np.eye(len(at), dtype=bool)).all()
     assert ((at > 0) & (at < [640, 480])).all()
+    assert ((at >= [290, 300]).any(axis=1)).all()  # none below the legend
 
 
 def test_a_number_outside_of_the_picture_is_left_out() -> None:
-    assert _apart({0: np.array([-5.0, 10.0])}, np.array([640, 480])) == {}
+    assert _apart({0: np.array([-5.0, 10.0])}, np.array([640, 480]), np.zeros(2)) == {}
     image = with_numbers(grey(), {0: np.array([-5.0, 10.0])}, {0: (1.0, 0.0, 0.0)})
     np.testing.assert_allclose(image, grey(), atol=2e-3)
 
