@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
+import httpx
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -97,3 +100,18 @@ def test_a_damaged_tile_is_refused(run: RunCommand, tiled: Path) -> None:
     data[-1] ^= 1
     (tiled / "tiles.bin").write_bytes(data)
     assert_refused(run("render", tiled), "tiles.bin")
+
+
+def test_serve_takes_the_folder(tiled: Path) -> None:
+    words = [sys.executable, "-m", "splatbot", "serve", "--map", str(tiled), "--port", "0"]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        try:
+            url = next(found[1] for line in process.stdout if (found := re.search(r"serving on (\S+)", line)))
+            described = httpx.get(f"{url}/v1/maps/default").json()
+            points = {"points": [[2.0, 2.0, 0.0], [2.0, 2.0, 0.7]]}
+            near = httpx.post(f"{url}/v1/maps/default/distance", json=points).json()
+        finally:
+            process.terminate()
+    assert (described["gaussians"], described["source"]) == (2000, "tiles")
+    assert near["distance_m"][0] < 0.5 < near["distance_m"][1]
