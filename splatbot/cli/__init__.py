@@ -29,6 +29,9 @@ COMMANDS = {
     "batch": _Command(
         "splatbot.cli.batch", "batch", "Run a command for many logs or options, in parallel or on a Ray cluster."
     ),
+    "prepare": _Command(
+        "splatbot.cli.prepare", "prepare", "Estimate the poses of photographs or of a video by COLMAP, for `train`."
+    ),
     "train": _Command(
         "splatbot.cli.train", "train", "Train a map from posed photographs, or improve the map of a run."
     ),
