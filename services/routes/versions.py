@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Path, Response
 
-from splatbot.services.codecs import body_of, request_body
+from splatbot.services.codecs import JSON, body_of, request_body
 from splatbot.services.dependencies import Caller, Served, Service, example, problems
 from splatbot.services.schemas import VersionInfo, VersionList, VersionRequest
 from splatbot.services.store import ServedMap
@@ -33,7 +33,11 @@ _EXAMPLE: dict[str, Any] = {
 }
 _REQUESTS = {"with a label": {"label": "clean table", "note": "before the shift"}, "without": {}}
 _SAVED: dict[int | str, dict[str, Any]] = {
-    201: {"description": "the version; `Location` names it", "model": VersionInfo}
+    201: {
+        "description": "the version; `Location` names it",
+        "model": VersionInfo,
+        "content": {JSON: {"example": _EXAMPLE}},
+    }
 }
 _Number = Annotated[int, Path(ge=1, le=2**31 - 1, description="as GET .../versions lists it", examples=[1])]
 

@@ -286,7 +286,7 @@ def _killed(folder: Path, choice: str) -> tuple[bool, int]:
 STEPS: list[set[int]] = [set(), {1}, {1, 2}, {1, 2, 3}, {1, 3}]
 
 
-@pytest.mark.parametrize(("torn", "step"), [("", 1), (":torn", 4)])
+@pytest.mark.parametrize(("torn", "step"), [("", 4), (":torn", 5), pytest.param("", 1, marks=pytest.mark.long)])
 def test_killed_at_any_point_each_version_is_whole_or_absent(tmp_path: Path, torn: str, step: int) -> None:
     """A process is killed at every write, flush, rename and commit in turn; files without a version are swept."""
     point, kills = 1 - step, 0
