@@ -9,7 +9,7 @@ import torch
 
 from splatbot.collision.hulls import group_sums
 from splatbot.gaussians import GaussianModel
-from splatbot.gaussians.model import SCALE_MIN
+from splatbot.gaussians.model import OPACITY_MIN, SCALE_MIN
 from splatbot.geometry import quat_to_rotation, rotation_to_quat
 from splatbot.protocols import Array
 from splatbot.tiles.part import MapPart
@@ -78,14 +78,14 @@ def _of_moments(part: MapPart, of: Ints, n: int) -> MapPart:
 
     Without members of its own, no keyframe supports it: a collision field ignores it.
     """
-    model, single = part.model, np.bincount(of, minlength=n)[of] == 1
-    alone = part.select(torch.from_numpy(single))
-    if single.all():
+    single = np.bincount(of, minlength=n)[of] == 1
+    alone, members = part.select(torch.from_numpy(single)), part.select(torch.from_numpy(~single))
+    if not len(members):
         return alone
-    _, of = np.unique(of[~single], return_inverse=True)
-    model, rows, n = model.select(torch.from_numpy(~single)), part.rows[torch.from_numpy(~single)], int(of.max()) + 1
-    means, scales = model.means.double().numpy(), model.scales.double().numpy()
-    mass = model.opacities.double().numpy() * _area(scales)
+    groups, of = np.unique(of[~single], return_inverse=True)
+    model, n = members.model, len(groups)
+    means, scales = model.means.double().numpy(), np.exp(model.log_scales.double().numpy()).clip(SCALE_MIN)
+    mass = model.opacities.double().numpy().clip(OPACITY_MIN) * _area(scales)
     total = np.bincount(of, mass, n)
     share = (mass / total[of])[:, None]
     centres = group_sums(share * means, of, n)
@@ -95,10 +95,10 @@ def _of_moments(part: MapPart, of: Ints, n: int) -> MapPart:
     values, axes = np.linalg.eigh(group_sums(share * moments.reshape(-1, 9), of, n).reshape(-1, 3, 3))
     axes[:, :, 0] *= np.linalg.det(axes)[:, None]  # eigenvectors may be left-handed
     sigmas = np.sqrt(np.maximum(values, SCALE_MIN**2))
-    opacities = np.clip(total / _area(sigmas), 1e-6, CONSTANTS.most_opacity)
+    opacities = np.clip(total / _area(sigmas), OPACITY_MIN, CONSTANTS.most_opacity)
     sh = group_sums(share * model.sh.double().numpy().reshape(len(model), -1), of, n)
     first = np.full(n, np.iinfo(np.int32).max, np.int32)
-    np.minimum.at(first, of, rows.numpy())
+    np.minimum.at(first, of, members.rows.numpy())
     joint = GaussianModel(
         means=torch.from_numpy(centres).float(),
         quats=torch.from_numpy(rotation_to_quat(axes).reshape(-1, 4)).float(),

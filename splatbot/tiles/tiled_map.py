@@ -242,15 +242,15 @@ class TiledMap:
         ends = np.stack([self._low, self._high], axis=1)
         corners = np.stack([ends[:, [i & 1, i >> 1 & 1, i >> 2], [0, 1, 2]] for i in range(8)], axis=1)
         x, y, z = np.moveaxis(transform_points(T_camera_world, corners), -1, 0)
-        visible = z.max(axis=1, initial=-np.inf) >= CONSTANTS.near
+        visible = z.max(axis=1) >= CONSTANTS.near
         pixels = 1.0 + CONSTANTS.sigmas * np.sqrt(CONSTANTS.blur)
         axes = ((x, camera.fx, camera.cx + 0.5, camera.width), (y, camera.fy, camera.cy + 0.5, camera.height))
         slopes = [(max(abs(c), abs(size - c)) + CONSTANTS.fov_margin * size) / f for _, f, c, size in axes]
         reach = CONSTANTS.sigmas * float(np.sqrt(1.0 + slopes[0] ** 2 + slopes[1] ** 2)) * self._scales
         for along, f, c, size in axes:
-            visible &= (f * along + (c + pixels) * z).max(axis=1, initial=-np.inf) + f * reach >= 0.0
-            visible &= (f * along + (c - size - pixels) * z).min(axis=1, initial=np.inf) - f * reach <= 0.0
-        return visible, np.maximum(z.min(axis=1, initial=np.inf), CONSTANTS.near)
+            visible &= (f * along + (c + pixels) * z).max(axis=1) + f * reach >= 0.0
+            visible &= (f * along + (c - size - pixels) * z).min(axis=1) - f * reach <= 0.0
+        return visible, np.maximum(z.min(axis=1), CONSTANTS.near)
 
     def _load(self, number: int) -> MapPart:
         """Return the Gaussians of a tile; the least recently used tiles leave the memory for it.

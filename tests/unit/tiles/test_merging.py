@@ -96,6 +96,16 @@ def test_no_more_gaussians_remain_than_requested_and_no_keyframe_supports_merged
     assert merged(part, 500, 2 * edge)[1] >= 2 * edge
 
 
+def test_vanishing_scales_and_opacities_merge_to_finite_values() -> None:
+    part = part_of(pairs(8, 1e-12, scale=0.0), np.full((16, 3), 0.1), np.full(16, 0.5))
+    part.model.log_scales[:] = -300.0
+    part.model.opacity_logits[:] = -300.0
+    found, _ = merged(part, 8)
+    assert len(found) == 8
+    for values in (found.model.means, found.model.quats, found.model.log_scales, found.model.opacity_logits):
+        assert torch.isfinite(values).all()
+
+
 def test_thousands_of_equal_gaussians_become_one() -> None:
     found, _ = merged(part_of(np.ones((3000, 3)), np.full((3000, 3), 0.01), np.full(3000, 0.9)), 8)
     assert len(found) == 1
