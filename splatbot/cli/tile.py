@@ -114,7 +114,7 @@ def _sweep(model: GaussianModel, map_: Path, folder: Path, memory_mb: float) -> 
         ("spheres, hits", f"{count(queries.spheres)}, {count(queries.hits)}"),
         ("verdicts unlike the whole map's", count(queries.different)),
     ]
-    print_table(rows, title="collision queries in boxes of 1.5 m, each after a cold start; the slowest")
+    print_table(rows, title="collision queries in boxes of 1.5 m, each after a cold start; median times")
 
 
 def _views(model: GaussianModel, map_: Path) -> tuple[list[SweepView], str]:
