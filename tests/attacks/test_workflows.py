@@ -1,9 +1,10 @@
-"""Sequences of requests that use each other's answers (schemathesis, stateful): maps, jobs, plans, leases."""
+"""Sequences of requests that use each other's answers (schemathesis, stateful): maps, jobs, plans, leases, versions."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -22,10 +23,10 @@ FOLLOWED = 100  # requests that take a value of an earlier answer
 
 
 @pytest.fixture
-def api() -> Iterator[Service]:
+def api(tmp_path: Path) -> Iterator[Service]:
     store = MapStore()
-    store.add("default", source="wall.ply", state="static", snapshot=wall())
-    with running(SETTINGS, store) as service:
+    store.add("default", source="a log", state="ended", snapshot=wall())
+    with running(SETTINGS.model_copy(update={"data_dir": tmp_path}), store) as service:
         yield service
 
 
