@@ -59,6 +59,7 @@ CONSTANTS = MapPickConstants()
 _FINE = {"objects": False, "ellipsoids": 4000}  # primitives and coarse ellipsoids reach millimetres beyond the map
 
 TARGET = "target"
+_COLOR = (0.95, 0.5, 0.1)  # which few objects have
 """Name of the target in the twin."""
 
 
@@ -240,7 +241,7 @@ def _with_target(scene: Scene, clutter: Clutter, sampler: GraspSampler, target: 
             (parts.centers - middle).tolist(), parts.axes.tolist(), quat_to_rotation(parts.quats), strict=True
         )
     ]
-    values = {"name": TARGET, "shapes": shapes, "at": middle.tolist(), "movable": True}
+    values = {"name": TARGET, "shapes": shapes, "at": middle.tolist(), "movable": True, "color": _COLOR}
     without = [tuple(ball) for ball in np.c_[transform_points(T_base_world, balls[:, :3]), balls[:, 3]].tolist()]
     return scene.model_copy(
         update={

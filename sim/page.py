@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from splatbot.protocols import Array
-from splatbot.report.moving_page import bytes_of, evenly_spaced, moving_page, packed
+from splatbot.report.moving_page import MAP_IN_COLORS, bytes_of, css, evenly_spaced, moving_page, packed
 from splatbot.sim.clutter import REPRESENTED
 from splatbot.sim.contact_monitor import FAR
 from splatbot.sim.recording import TwinRecording
@@ -29,6 +29,8 @@ class TwinPageConstants:
         crop_radius: [m] radius of the map around the robot that is shown.
         floor: [m] half-extent of planes.
         point_size: [m] size of a point.
+        yaw: [rad] direction of the view around the z axis; at 4.9 the arm reaches to the right.
+        distance: distance of the camera, relative to the extent of the motion.
     """
 
     max_points: int = 20_000
@@ -37,9 +39,12 @@ class TwinPageConstants:
     crop_radius: float = 1.6
     floor: float = 0.8
     point_size: float = 0.006
+    distance: float = 1.5
+    yaw: float = 4.9
 
 
 CONSTANTS = TwinPageConstants()
+_ROBOT, _PATH, _CONTACT = (0.75, 0.76, 0.79), (0.2, 0.75, 0.85), (1.0, 0.24, 0.24)
 
 
 def twin_html(recording: TwinRecording, result: TwinResult) -> str:
@@ -56,13 +61,20 @@ def recording_html(recording: TwinRecording, *, title: str, facts: str) -> str:
         facts: results of the run, one line.
     """
     world = recording.world
-    own, tints, body, points, colors = _clouds(world)
+    own, normals, tints, body, points, colors = _clouds(world)
+    path = _tool_path(recording)
+    shown_bodies = world.model.geom_bodyid[world.of_robot] if world.of_robot.any() else body.astype(np.int64)
+    moving = np.concatenate([path, recording.poses[:, np.unique(shown_bodies), :, 3].reshape(-1, 3), np.zeros((1, 3))])
+    low, high = moving.min(axis=0), moving.max(axis=0)
     shown, shades = _map_points(world)
     document = {
         "points": packed(np.concatenate([shown, points]), np.float32),
         "colors": packed(bytes_of(np.concatenate([shades, colors])), np.uint8),
         "own": packed(own, np.float32),
+        "normals": packed(np.rint(127 * normals), np.int8),
         "tints": packed(bytes_of(tints), np.uint8),
+        "path": packed(path, np.float32),
+        "pathColor": [round(255 * part) for part in _PATH],
         "body": packed(body, np.uint16),
         "bodies": int(world.model.nbody),
         "poses": packed(recording.poses, np.float32),
@@ -71,11 +83,36 @@ def recording_html(recording: TwinRecording, *, title: str, facts: str) -> str:
         "clearances": np.round(recording.clearances, 5).tolist(),
         "far": FAR,
         "times": np.round(recording.times, 4).tolist(),
-        "middle": [0.35, 0.0, 0.25],
-        "distance": 2.2,
+        "middle": ((low + high) / 2).round(3).tolist(),
+        "distance": round(max(1.2, CONSTANTS.distance * float(np.linalg.norm(high - low))), 3),
+        "yaw": CONSTANTS.yaw,
         "size": CONSTANTS.point_size,
     }
-    return moving_page(title, facts, document, "twin_view.js", curve=True)
+    return moving_page(title, facts, document, "twin_view.js", legend=_legend(world), curve=True)
+
+
+def _legend(world: World) -> list[tuple[str, str]]:
+    """Return the name and the CSS colour of each part that the page draws."""
+    objects = [obj for obj in world.scene.objects if obj.movable or obj.path]
+    rows = [] if world.parts is None else [MAP_IN_COLORS]
+    if world.robot is not None:
+        rows += [("arm and hand: their collision shapes, larger than the real ones", css(_ROBOT)),
+                 ("path of the tool", css(_PATH))]  # fmt: skip
+    rows += [(obj.name if obj.name != "target" else "target: its completed surface", css(obj.color)) for obj in objects]
+    return [
+        *rows,
+        ("contact of the arm; in the curve its time", css(_CONTACT)),
+        ("clearance of the arm", "var(--curve)"),
+    ]
+
+
+def _tool_path(recording: TwinRecording) -> Array:
+    """Return the positions (T, 3) of the tool over time [m], (0, 3) without a robot."""
+    if recording.world.robot is None:
+        return np.zeros((0, 3))
+    site = recording.world.model.site("tcp")
+    poses = recording.poses[:, int(site.bodyid[0])]
+    return np.asarray(poses[:, :, :3] @ site.pos + poses[:, :, 3])
 
 
 def _facts(result: TwinResult) -> str:
@@ -92,13 +129,13 @@ def _facts(result: TwinResult) -> str:
     return "; ".join((*found, *result.warnings))
 
 
-def _clouds(world: World) -> tuple[Array, Array, np.ndarray, Array, Array]:
-    """Sample points (P, 3) on moving bodies with colours and bodies (P,), and points and colours of fixed ones.
+def _clouds(world: World) -> tuple[Array, Array, Array, np.ndarray, Array, Array]:
+    """Sample points (P, 3) on moving bodies with normals, colours and bodies, and points and colours of fixed ones.
 
     Fitted objects of a map are represented by its Gaussians unless they move.
     """
     m, fixed = world.model, np.asarray(world.model.body_weldid) == 0
-    moving: list[tuple[Array, Array, np.ndarray]] = []
+    moving: list[tuple[Array, Array, Array, np.ndarray]] = []
     still: list[tuple[Array, Array]] = []
     for geom in range(m.ngeom):
         number = int(m.geom_bodyid[geom])
@@ -109,17 +146,29 @@ def _clouds(world: World) -> tuple[Array, Array, np.ndarray, Array, Array]:
         )
         R = np.zeros(9)
         mujoco.mju_quat2Mat(R, m.geom_quat[geom])
+        normals = _outward(m, geom, points) @ R.reshape(3, 3).T
         points = points @ R.reshape(3, 3).T + m.geom_pos[geom]
-        color = np.tile(m.geom_rgba[geom, :3], (len(points), 1))
+        color = np.tile(_ROBOT if world.of_robot[geom] else m.geom_rgba[geom, :3], (len(points), 1))
         if fixed[number] and not world.of_robot[geom]:
             mujoco.mju_quat2Mat(R, m.body_quat[number])
             still.append((points @ R.reshape(3, 3).T + m.body_pos[number], color))
         else:
-            moving.append((points, color, np.full(len(points), number)))
+            moving.append((points, normals, color, np.full(len(points), number)))
     none = np.zeros((0, 3))
-    own, tints, bodies = (np.concatenate(part) for part in zip((none, none, np.zeros(0)), *moving, strict=True))
+    own, normals, tints, bodies = (
+        np.concatenate(part) for part in zip((none, none, none, np.zeros(0)), *moving, strict=True)
+    )
     points, colors = (np.concatenate(part) for part in zip((none, none), *still, strict=True))
-    return own, tints, bodies, points, colors
+    return own, normals, tints, bodies, points, colors
+
+
+def _outward(m: Any, geom: int, points: Array) -> Array:
+    """Return unit vectors (P, 3) from the middle of a geom to its points, from the axis of a capsule or cylinder."""
+    types = mujoco.mjtGeom
+    away = points.copy()
+    if int(m.geom_type[geom]) in (int(types.mjGEOM_CAPSULE), int(types.mjGEOM_CYLINDER)):
+        away[:, 2] -= np.clip(away[:, 2], -m.geom_size[geom, 1], m.geom_size[geom, 1])
+    return np.asarray(away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9))
 
 
 def _map_points(world: World) -> tuple[Array, Array]:

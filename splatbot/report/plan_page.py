@@ -19,7 +19,7 @@ from splatbot.planning.timing import clearance_text
 from splatbot.protocols import Array
 from splatbot.rasterize.views import to_png
 from splatbot.report.annotations import Color, with_legend, with_ring, with_scale
-from splatbot.report.moving_page import bytes_of, evenly_spaced, moving_page, packed
+from splatbot.report.moving_page import MAP_IN_COLORS, bytes_of, evenly_spaced, moving_page, packed
 from splatbot.report.robot_drawing import DrawnPart, draw_robot, map_view
 from splatbot.report.sphere_gaussians import sphere_gaussians
 
@@ -49,6 +49,11 @@ CONSTANTS = PlanPageConstants()
 _START, _END = np.array([0.15, 0.45, 0.9]), np.array([0.95, 0.5, 0.1])  # tints of the ends
 _START_SHADE, _END_SHADE = (0.49, 0.67, 0.94), (0.97, 0.7, 0.46)  # as the shaded arms look
 _FROM = np.array([-1.3, 1.3, 1.0])  # direction from the middle of the motion to the camera, in the base frame
+_PAGE_LEGEND = (
+    MAP_IN_COLORS,
+    ("arm, or its certified spheres", "linear-gradient(90deg, #b9bcc4, #5d6066)"),
+    ("path of the tool", "rgb(240, 120, 30)"),
+)
 _NEAREST, _TOOL, _SOLID = (1.0, 0.15, 0.2), (0.2, 0.9, 0.95), (0.65, 0.3, 0.95)
 
 
@@ -98,6 +103,7 @@ def plan_html(
         "clearances": clearances.round(4).tolist(),
         "middle": middle.round(3).tolist(),
         "distance": 2.2,
+        "yaw": 3.6,
         "size": 0.006,
     }
     c = trajectory.certificate
@@ -105,7 +111,7 @@ def plan_html(
         f"{trajectory.duration:.2f} s; {'certified' if c.certified else 'NOT certified'}, clearance "
         f"{clearance_text(c)}; map version {c.map_version}"
     )
-    return moving_page(title, facts, document, "plan_view.js", toggle="certified spheres")
+    return moving_page(title, facts, document, "plan_view.js", legend=_PAGE_LEGEND, toggle="certified spheres")
 
 
 def plan_png(
@@ -139,9 +145,13 @@ def plan_png(
     camera, T_world_camera, away = _framed(arm, moments, width)
     tool = (arm.T_world_base @ fk(moments)[:, -1] @ T_link_tcp)[:, :3, 3]
     drawn = [model.select(torch.from_numpy(near)), _dots(tool, 0.004, _TOOL)]
-    legend = [("arm at the start", _START_SHADE), ("arm at the goal", _END_SHADE), ("path of the tool", _TOOL)]
+    legend = [
+        ("arm at the start", _START_SHADE),
+        ("arm at the goal; transparent: in between", _END_SHADE),
+        ("path of the tool", _TOOL),
+    ]
     if nearest is not None:
-        least = f"nearest to the map, {1e3 * nearest.clearance:.1f} mm beyond the margin"
+        least = f"ring: nearest to the map, {1e3 * nearest.clearance:.1f} mm beyond the margin"
         legend.append((f"{least}, at {nearest.time:.1f} s", _NEAREST))
     view, depth = map_view(GaussianModel.concatenate(drawn), camera, T_world_camera)
     links = arm.T_world_base @ fk(trajectory.at(times).position)
@@ -192,7 +202,7 @@ def refused_png(
     camera, T_world_camera, away = _framed(arm, q[None], width)
     at = transform_points(arm.T_world_base, point[None])[0]
     drawn = [model.select(torch.from_numpy(_within(model, inverse(arm.T_world_base))))]
-    legend = [("arm at the refused configuration", _END_SHADE), (reason, _NEAREST)]
+    legend = [("arm at the refused configuration", _END_SHADE), (f"ring: {reason}", _NEAREST)]
     if solids is not None and len(solids):
         centers = solids.means.double().numpy()
         near = np.linalg.norm(centers - at, axis=1) < CONSTANTS.shown_solids

@@ -4,7 +4,8 @@
 "use strict";
 const canvas = document.getElementById("view"), slider = document.getElementById("time"), label = document.getElementById("label");
 const pen = canvas.getContext("2d"), steps = data.times.length, button = document.getElementById("play");
-let yaw = 3.6, pitch = 0.5, distance = data.distance, playing = false;
+const styled = (name) => getComputedStyle(document.documentElement).getPropertyValue(name);
+let yaw = data.yaw, pitch = 0.5, distance = data.distance, playing = false;
 slider.max = steps - 1;
 
 function basis() {  // camera axes in a z-up world
@@ -40,7 +41,7 @@ function draw() {
   };
   scene(drawPoint, at, drawTriangle);
   shown.sort((a, b) => b[0] - a[0]);
-  pen.fillStyle = "#16181d";
+  pen.fillStyle = styled("--page");
   pen.fillRect(0, 0, w, h);
   for (const [, u, v, size, r, g, b, alpha] of shown) {
     if (alpha !== undefined) {
@@ -107,6 +108,7 @@ window.addEventListener("keydown", (e) => {
 });
 setInterval(() => { if (playing) go(Number(slider.value) + 1); }, Math.max(30, (1000 * data.times[steps - 1]) / Math.max(1, steps - 1)));
 window.addEventListener("resize", draw);
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
 const begin = /#t=([0-9.]+)/.exec(location.hash);
 const first = begin ? data.times.findIndex((t) => t >= Number(begin[1]) - 1e-9) : 0;
 go(first < 0 ? steps - 1 : first);

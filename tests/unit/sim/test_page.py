@@ -21,6 +21,8 @@ from splatbot.sim.recording import CONSTANTS as RECORDING
 from splatbot.sim.recording import TwinRecording
 from splatbot.sim.scene import load_scene, make_scene
 from splatbot.sim.twin import Twin, TwinResult
+from tests.browser.chromium import Chromium
+from tests.unit.batch.processes import wait_until
 
 _SHAPES: list[dict[str, Any]] = [
     {"kind": "box", "size": [0.1, 0.2, 0.3]},
@@ -90,6 +92,36 @@ def test_the_pages_bodies_are_where_mujocos_geoms_are() -> None:
     assert np.linalg.norm(shown - recording.poses[-1, mug, :, 3], axis=1).max() < 0.15
     assert values["contacts"][-1]
     assert {number for number in body if recording.world.of_robot[model.body_geomadr[number]]}
+
+
+def test_the_path_of_the_tool_is_that_of_mujocos_site() -> None:
+    recording, result = recorded()
+    seen: list[np.ndarray] = []
+    twin = Twin(load_scene("mug_hanging"))
+    twin.follow(watch=lambda data, time: seen.append(data.site("tcp").xpos.copy()) if time in recording.times else None)
+    path = unpacked(document(twin_html(recording, result))["path"], np.float32).reshape(-1, 3)
+    np.testing.assert_allclose(path, np.array(seen), atol=1e-6)
+
+
+def test_normals_of_moving_points_are_unit_vectors() -> None:
+    normals = unpacked(document(twin_html(*recorded()))["normals"], np.int8).reshape(-1, 3) / 127
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=0.02)
+
+
+def test_the_page_names_all_that_it_draws_and_fits_a_phone(browser: str, tmp_path: Path) -> None:
+    page = twin_html(*recorded())
+    rows = re.findall(r"<li><i [^>]*></i>([^<]*)</li>", page)
+    assert rows[0].startswith("arm and hand")
+    assert {"path of the tool", "mug", "clearance of the arm"} < set(rows)
+    with Chromium(tmp_path / "profile", width=360, height=640) as chromium:
+        (tmp_path / "run.html").write_text(page)
+        for scheme, page_color in (("light", "rgb(238, 240, 243)"), ("dark", "rgb(22, 24, 29)")):
+            chromium.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
+            chromium.open(f"file://{tmp_path / 'run.html'}")
+            wait_until(lambda: chromium.evaluate("document.getElementById('label')?.textContent || ''") != "")
+            assert chromium.evaluate("getComputedStyle(document.body).backgroundColor") == page_color
+            assert chromium.evaluate("document.documentElement.scrollWidth") <= 360
+            assert chromium.evaluate("document.getElementById('view').clientHeight") > 150
 
 
 def test_a_map_is_shown_by_its_gaussians_less_those_that_move(tmp_path: Path) -> None:
