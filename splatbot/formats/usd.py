@@ -50,6 +50,7 @@ MAX_SH_DEGREE = 3
 _TYPE = "ParticleField3DGaussianSplat"
 _MAX_READ_DEGREE = 4
 _MEMORY = 2**30  # [bytes] of OpenUSD and its libraries, without the content of a file
+_ONE_THREAD = {"PXR_WORK_THREAD_LIMIT": "1", "OPENBLAS_NUM_THREADS": "1"}  # each thread counts as memory
 _SECONDS, _BYTES_PER_SECOND = 60.0, 1e6  # for OpenUSD to read a file
 _REACH = 3.0  # [standard deviations] of the extent around a mean
 
@@ -158,7 +159,7 @@ def _read_prims(path: str | Path) -> tuple[dict[str, Any], list[dict[str, NDArra
         link.symlink_to(Path(path).resolve())  # OpenUSD chooses the format by the suffix
         memory, seconds = _MEMORY + MAX_EXPANSION * size, _SECONDS + size / _BYTES_PER_SECOND
         words = [sys.executable, "-m", usd_prims.__name__, str(link), str(target), str(memory)]
-        environment = os.environ | {"TMPDIR": folder}  # for the reports of OpenUSD on its own end
+        environment = os.environ | _ONE_THREAD | {"TMPDIR": folder}  # for the reports of OpenUSD on its own end
         try:
             done = subprocess.run(
                 words, env=environment, stdin=subprocess.DEVNULL, capture_output=True, timeout=seconds
