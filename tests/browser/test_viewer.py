@@ -190,13 +190,17 @@ def test_the_page_of_a_plan_shows_meshes_or_certified_spheres(browser: Chromium,
     model, arm = GaussianModel.empty(), RobotSpheres(robot, T_world_base=np.eye(4))
     parts, field = coarse_appearance(robot), GaussianCollisionField(model)
     (tmp_path / "plan.html").write_text(plan_html(model, arm, field, plan, parts, robot.fk, title="a plan"))
+    dark = {"name": "prefers-color-scheme", "value": "dark"}
+    browser.call("Emulation.setEmulatedMedia", features=[dark])
     browser.open(f"file://{tmp_path / 'plan.html'}")
     time.sleep(1.0)
+    names = browser.evaluate("[...document.querySelectorAll('#legend li')].map((row) => row.textContent).join('; ')")
+    assert names == "map, in its own colours; arm, or its certified spheres; path of the tool"
     meshes = browser.screenshot().astype(int)
     browser.evaluate("document.getElementById('toggle').click()")
     time.sleep(0.5)
     spheres = browser.screenshot().astype(int)
-    drawn, covered = (image[40:-60].max(axis=2) > 60 for image in (meshes, spheres))
+    drawn, covered = (image[80:-60].max(axis=2) > 60 for image in (meshes, spheres))
     assert drawn.mean() > 0.01
     assert (drawn & ~covered).sum() < 0.05 * drawn.sum()  # the spheres contain the meshes
     assert covered.sum() > drawn.sum()
