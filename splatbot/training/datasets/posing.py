@@ -77,11 +77,10 @@ def pose_photographs(
     found = {model: _count(model) for model in models.iterdir() if model.is_dir()}
     if not found:
         raise LogError("finds no poses.", field="colmap", hint=_OVERLAP)
-    best = max(found, key=lambda model: (found[model], model.name))
-    best.rename(scene / "best")
-    shutil.rmtree(models)
-    models.mkdir()
-    (scene / "best").rename(models / "0")
+    best = max(sorted(found), key=lambda model: found[model])
+    for model in found.keys() - {best}:
+        shutil.rmtree(model)
+    best.rename(models / "0")
     return Posed(found[best], len(found))
 
 
@@ -103,4 +102,5 @@ def _run(words: list[str], log: Path, step: str) -> None:
     if code:
         last = log.read_text(errors="replace").strip().rpartition("\n")[2][-300:]
         problem = f"ends with {code} in the step {step}: {last}" if last else f"ends with {code} in the step {step}"
-        raise LogError(f"{problem}.", field="colmap", hint=_OVERLAP)
+        hint = _OVERLAP if step == "mapper" else "check the installation of COLMAP (`colmap` on the PATH, or pycolmap)"
+        raise LogError(f"{problem}.", field="colmap", hint=hint)
