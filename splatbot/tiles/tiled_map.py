@@ -164,9 +164,9 @@ class TiledMap:
         parts = [MapPart.empty(self.index.sh_degree)]
         for number in found.tolist():
             part = self._load(number)
-            means = part.model.means.double().numpy()
-            scales = part.model.scales.amax(1).double().numpy().clip(SCALE_FLOOR)
-            parts.append(part.select(torch.from_numpy(_meets(box, means, means, reach * scales))))
+            means = part.model.means.numpy().astype(np.float64)
+            scales = np.exp(part.model.log_scales.numpy().max(axis=1).astype(np.float64)).clip(SCALE_FLOOR)
+            parts.append(part.select(torch.from_numpy(np.flatnonzero(_meets(box, means, means, reach * scales)))))
         return MapPart.union(parts)
 
     def field(self, low: ArrayLike, high: ArrayLike, n_sigma: float = 2.0, *, reach: float = 0.0) -> TiledField:
