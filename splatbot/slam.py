@@ -26,9 +26,9 @@ from splatbot.mapping.mapper import Mapper
 from splatbot.mapping.observation import GraphLocation, Observation
 from splatbot.mapping.refine import Stop, never
 from splatbot.tracking.health import Verdict
+from splatbot.tracking.motion_filter import mean_twist
 from splatbot.tracking.prepare import MIN_DISPLACEMENT, PreparedFrame, displacement, prepare
 from splatbot.tracking.tracker import PoseEstimate, Tracker
-from splatbot.tracking.velocity import mean_twist
 from splatbot.trajectory import Trajectory
 
 P = ParamSpec("P")

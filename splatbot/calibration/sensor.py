@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -105,14 +105,22 @@ def calibrate_sensor(log: Log, *, report_progress: Callable[[str], None] = lambd
         raise InputError(
             f"has {len(log)} frames, {p.min_frames} are needed.", file=log.uri, field="log", hint="record a longer log"
         )
-    frames, views = [], []
+    frames = []
     for index in range(min(len(log), p.max_frames)):
-        frame = log[index]
-        frame = replace(frame, depth=usable_depth(frame, TrackingConfig()))
-        found = detect(frame.rgb, frame.depth, frame.camera, p.features, frame.mask)
-        frames.append(frame)
-        views.append(View(frame.stamp, found))
+        frames.append(log[index])
         report_progress(f"frame {index + 1}")
+    return calibrate_frames(frames, report_progress=report_progress)
+
+
+def calibrate_frames(
+    frames: Sequence[Frame], *, report_progress: Callable[[str], None] = lambda _: None
+) -> SensorCalibration:
+    """Estimate the times, the registration and the bias of a sensor from consecutive frames of one camera."""
+    frames = [replace(frame, depth=usable_depth(frame, TrackingConfig())) for frame in frames]
+    views = []
+    for number, frame in enumerate(frames, 1):
+        views.append(view_of(frame))
+        report_progress(f"features {number}")
     camera = frames[0].camera
     report_progress("matching")
     rows = estimate_rows(views, match_pairs(views, camera), camera)
@@ -123,6 +131,11 @@ def calibrate_sensor(log: Log, *, report_progress: Callable[[str], None] = lambd
         report_progress("matching again")
         rows = estimate_rows(views, match_pairs(views, camera), camera)
     return SensorCalibration(rows.readout, timing.delay, timing.right, timing.down, rows.bias, camera)
+
+
+def view_of(frame: Frame) -> View:
+    """Return the keypoints of a frame with their depth."""
+    return View(frame.stamp, detect(frame.rgb, frame.depth, frame.camera, CONSTANTS.features, frame.mask))
 
 
 def _registered(view: View, frame: Frame, twist: Array | None, timing: DepthTiming) -> View:

@@ -258,6 +258,16 @@ def _pace(metrics: dict[str, Any]) -> list[tuple[str, str]]:
     return [("paced", f"{metrics['late']} frames late, {metrics['dropped']} dropped")]
 
 
+def _sensor(timing: dict[str, Any] | None) -> list[tuple[str, str]]:
+    if timing is None:
+        return []
+    text = f"rolling shutter {1e3 * timing['readout_s']:.0f} ms"
+    delay = 1e3 * timing["depth_delay_s"]
+    if delay:
+        text += f", depth {abs(delay):.0f} ms {'late' if delay > 0 else 'early'}"
+    return [("sensor, estimated", text)]
+
+
 def _mishaps(metrics: dict[str, Any]) -> list[tuple[str, str]]:
     counts = [f"{metrics[name]} {name}" for name in ("lost", "degraded") if metrics[name]]
     return [("of them", ", ".join(counts))] if counts else []
@@ -274,6 +284,7 @@ def _print_summary(result: RunResult) -> None:
         ("frames tracked", f"{m['tracked']} of {m['frames']}" + (f", {m['skipped']} skipped" if m["skipped"] else "")),
         *_mishaps(m),
         *_pace(m),
+        *_sensor(m.get("sensor_timing")),
         ("ATE RMSE", metres(m["ate_rmse_m"]) + (" from the log's reference poses" if m["ate_frames"] else "")),
         ("PSNR, held-out views", decibels(m["psnr_holdout_db"])),
         ("depth error, median", metres(m["depth_median_m"])),

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from splatbot.calibration.timing import SensorTiming, with_estimated_timing
 from splatbot.config import Config, with_cameras, with_sensor
 from splatbot.errors import InputError, LogError
 from splatbot.logs import Log
@@ -117,10 +118,18 @@ def map_log(
         threaded = config.mapping.model_copy(update={"threaded": True})
         wall_clock = config.tracking.model_copy(update={"deterministic": False})
         config = config.model_copy(update={"mapping": threaded, "tracking": wall_clock})
+    frames = _frames(log, max_frames, realtime, rate)
+    timing: SensorTiming | None = None
+    report_step = on_progress or (lambda _: None)
+    if slam is None and not isinstance(log, RecordedCamera):
+
+        def calibrating(step: str) -> None:
+            report_step(Progress("calibrating", 0, frames.total, 0.0))
+
+        config, timing = with_estimated_timing(config, log, frames.total, report_progress=calibrating)
     folder = RunFolder.create(out)
     truth = log.ground_truth  # read now: a damaged file must not cost the user a whole run
-    frames = _frames(log, max_frames, realtime, rate)
-    loop = FrameLoop(frames, slam or Slam(config), config, on_bad_frame, on_progress or (lambda _: None))
+    loop = FrameLoop(frames, slam or Slam(config), config, on_bad_frame, report_step)
     if resume is not None:
         resume_loop(loop, resume)
     with Interrupts() as interrupts:
@@ -128,6 +137,7 @@ def map_log(
         def outcome() -> RunOutcome:
             return RunOutcome(
                 loop=loop,
+                timing=timing,
                 source=source or {},
                 map_page=map_page,
                 report=report,

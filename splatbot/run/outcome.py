@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatbot import __version__
+from splatbot.calibration.timing import SensorTiming
 from splatbot.errors import SplatbotError
 from splatbot.gaussians import GaussianModel
 from splatbot.report import report_html
@@ -50,6 +51,7 @@ class RunOutcome:
     map_page: MapPage | None = None
     report: bool = True
     audit: RunAudit | None = None
+    timing: SensorTiming | None = None
 
     def save(self, folder: RunFolder) -> None:
         """Save the results, then score and report; a signal after the end of the mapping skips both."""
@@ -136,6 +138,7 @@ class RunOutcome:
             "map_bytes": self.model.nbytes,
             "paced": self.loop.source.pace,
             "effects": self.effects,
+            "sensor_timing": None if self.timing is None else self.timing.metrics(),
             "memory": self.loop.slam.memory,
             "loops": self.loop.slam.loop_counts,
             "skipped_gradients": self.loop.slam.skipped_gradients,

@@ -7,7 +7,7 @@ from typing import Literal
 
 from splatbot.slam import FrameResult
 
-Phase = Literal["mapping", "refining", "saving", "scoring", "reporting"]
+Phase = Literal["calibrating", "mapping", "refining", "saving", "scoring", "reporting"]
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from splatbot.tracking.budget import CostModel
 from splatbot.tracking.estimate import PoseEstimate
 from splatbot.tracking.features import Features, detect
 from splatbot.tracking.hypothesis import ScoredHypothesis
+from splatbot.tracking.motion_filter import CameraMotion, MotionFilter
 from splatbot.tracking.motion_model import ConstantVelocity, Prediction
 from splatbot.tracking.nearby_keyframes import TrackedKeyframe, order_by_distance, pose_distance
 from splatbot.tracking.prepare import MIN_DISPLACEMENT, PreparedFrame, displacement, prepare, valid_share
@@ -25,7 +26,6 @@ from splatbot.tracking.scheduler import StageScheduler
 from splatbot.tracking.stage import TrackingProblem
 from splatbot.tracking.stages import StageSet
 from splatbot.tracking.uncertainty import Uncertainty, world_uncertainty
-from splatbot.tracking.velocity import CameraVelocity, twist_of_rows
 
 __all__ = ["PoseEstimate", "TrackedKeyframe", "Tracker", "order_by_distance", "pose_distance"]
 
@@ -48,7 +48,7 @@ class Tracker:
     def __init__(self, config: TrackingConfig) -> None:
         self.config = config
         self.motion = ConstantVelocity()
-        self._velocity = CameraVelocity()
+        self._filter = MotionFilter()
         self._lost = False
         self._keyframe_uncertainty: WeakKeyDictionary[Features, Uncertainty] = WeakKeyDictionary()
         self.variance_scale = 1.0
@@ -70,12 +70,11 @@ class Tracker:
             return PoseEstimate(np.eye(4), "lost", (reason,), "start")
         if not float(np.nanstd(prepared.levels[0].gray)) >= _MIN_GRAY_STD:
             return PoseEstimate(np.eye(4), "lost", ("the image is blank",), "start")
-        if np.any(prepared.twist):
-            before, T_before = prepared.frame.stamp - _BEFORE_START, se3_exp(-_BEFORE_START * prepared.twist)
-            self.motion.update(before, T_before)
-            self._velocity.update(before, T_before)
-        self.motion.update(prepared.frame.stamp, np.eye(4))
-        self._velocity.update(prepared.frame.stamp, np.eye(4))
+        stamp, twist = prepared.frame.stamp, prepared.twist if np.any(prepared.twist) else None
+        if twist is not None:
+            self.motion.update(stamp - _BEFORE_START, se3_exp(-_BEFORE_START * twist))
+        self.motion.update(stamp, np.eye(4))
+        self._filter.update(CameraMotion.at_pose(stamp, np.eye(4), np.zeros((6, 6)), twist))
         return PoseEstimate(np.eye(4), "ok", (), "start")
 
     def track(self, prepared: PreparedFrame, keyframes: Sequence[TrackedKeyframe]) -> PoseEstimate:
@@ -89,6 +88,7 @@ class Tracker:
         best = self._rectify_again(best, problem, scheduler)
         pose, uncertainty = self._fuse_prior(best, trusted_prior, motion_prior)
         pose = self._confirm_relocalization(prepared.frame.stamp, pose)
+        pose, uncertainty = self._filter_motion(pose, uncertainty, problem.prepared, trusted_prior)
         self._update(prepared.frame.stamp, pose, robot_prior)
         return PoseEstimate.create(pose, uncertainty, problem, scheduler.budget)
 
@@ -110,17 +110,17 @@ class Tracker:
     def forget(self) -> None:
         """Discard the motion: the next frame may be anywhere in the map."""
         self.motion = ConstantVelocity()
-        self._velocity.forget()
+        self._filter.forget()
         self._lost = True
 
     def move(self, T_new_old: Array) -> None:
         """Move the last pose with a correction (4, 4) of the map at the camera; the velocity stays."""
         self.motion.move(T_new_old)
-        self._velocity.move(T_new_old)
+        self._filter.move(T_new_old)
 
     def expected_twist(self, stamp: float) -> Array:
         """Return the expected twist (6,) [m/s, rad/s] of the camera at a time [s], to rectify the frame."""
-        return self._velocity.at(stamp)
+        return self._filter.twist_at(stamp)
 
     def pose_at(self, stamp: float) -> tuple[Array, Array] | None:
         """Return the pose (4, 4) at a time [s] shortly after the last frame, and the covariance of that frame's pose.
@@ -183,14 +183,15 @@ class Tracker:
     ) -> ScoredHypothesis:
         """Align the frame again, rectified by the velocity that its pose implies, until its rows stay in place."""
         sensor = self.config.sensor
+        predicted = self._filter.predict(problem.prepared.frame.stamp)
         for _ in range(_MAX_RECTIFICATIONS):
             prepared = problem.prepared
-            frame = prepared.recorded
-            expected = self._velocity.at(frame.stamp, best.T_world_camera)
-            sigma, alignment = self._velocity.sigma(frame.stamp), best.hypothesis.alignment
-            twist = twist_of_rows(alignment, prepared.twist, expected, sigma, sensor.readout)
+            if predicted is None or best.verdict == "lost":
+                break
+            twist = self._measured(predicted, best, prepared).twist
             if displacement(prepared, twist, sensor) < MIN_DISPLACEMENT:
                 break
+            frame = prepared.recorded
             again = scheduler.align_again(prepare(frame, self.config, twist), best)
             if again.verdict == "lost" and best.verdict != "lost":  # the velocity is wrong
                 problem.replace_images(prepared, best.T_world_camera)
@@ -211,6 +212,34 @@ class Tracker:
             return pose.with_pose(T, pose.covariance), Uncertainty(random, known.moved, known.turned)
         pose = pose.with_pose(*fuse(pose, robot_prior, pose.covariance))
         return pose, self._uncertainty(pose)
+
+    def _filter_motion(
+        self,
+        pose: ScoredHypothesis,
+        uncertainty: Uncertainty,
+        prepared: PreparedFrame,
+        robot_prior: Prediction | None,
+    ) -> tuple[ScoredHypothesis, Uncertainty]:
+        """Weigh the pose against the motion so far; a robot prior knows the motion better and keeps the pose."""
+        if pose.verdict == "lost":
+            return pose, uncertainty
+        stamp, T = prepared.frame.stamp, pose.T_world_camera
+        predicted = self._filter.predict(stamp)
+        if predicted is None:
+            self._filter.update(CameraMotion.at_pose(stamp, T, self.variance_scale * pose.covariance))
+            return pose, uncertainty
+        state = self._measured(predicted, pose, prepared)
+        if robot_prior is not None:
+            self._filter.update(replace(state, T_world_camera=T))
+            return pose, uncertainty
+        self._filter.update(state)
+        pose = pose.with_pose(state.T_world_camera, state.covariance[:6, :6] / self.variance_scale)
+        return pose, self._uncertainty(pose)
+
+    def _measured(self, predicted: CameraMotion, pose: ScoredHypothesis, prepared: PreparedFrame) -> CameraMotion:
+        """Return the state of the motion after the measurement of a pose and its rows."""
+        covariance = self.variance_scale * pose.covariance
+        return predicted.measure(pose.hypothesis.alignment, covariance, prepared.twist, self.config.sensor.readout)
 
     def _uncertainty(self, pose: ScoredHypothesis) -> Uncertainty:
         """Compute the uncertainty of a pose in the world from its own and that of its keyframes."""
@@ -238,9 +267,8 @@ class Tracker:
         self._lost = pose.verdict == "lost"
         if self._lost:
             self.motion.forget_velocity(robot_prior)
-            self._velocity.forget()
+            self._filter.forget()
         else:
             self._search.restart()
             self.motion.update(stamp, pose.T_world_camera)
-            self._velocity.update(stamp, pose.T_world_camera)
             self._last_covariance = pose.covariance

@@ -234,7 +234,7 @@ def test_depth_of_another_instant_is_moved_to_that_of_colour_by_its_stamp() -> N
         stamps, poses = zip(*found, strict=True)
         errors.append(absolute_error(log.ground_truth, Trajectory(np.array(stamps), np.array(poses))).rmse)
     assert len(found) == len(log)
-    assert errors[1] < 0.5 * errors[0]  # 1.1 of 3.0 mm; 1.2 mm without a delay
+    assert errors[1] < 0.6 * errors[0]  # 1.1 of 2.1 mm; 1.2 mm without a delay
 
 
 @pytest.mark.parametrize("threaded", [False, True])

@@ -28,6 +28,7 @@ from splatbot.bench.tracking import (
 )
 from splatbot.bench.tracking.peers import Odometry, tracking_peers
 from splatbot.bench.tracking.stress import run_stress
+from splatbot.calibration.timing import with_estimated_timing
 from splatbot.config import Config, load_config, with_sensor
 from splatbot.evaluation import absolute_error, nees, relative_error
 from splatbot.frame import Frame
@@ -108,6 +109,8 @@ def run_tracking(settings: TrackingSettings, report_progress: ReportProgress = i
     results = Results(describe_machine((1,), peak_ms=20))
     for name, log in zip(distinct([log.name for log in logs]), logs, strict=True):
         calibrated = with_sensor(config, log.calibration.sensor, file=log.calibration.file)
+        report_progress(f"{name}: sensor")
+        calibrated, _ = with_estimated_timing(calibrated, log, settings.max_frames or len(log))
         for contender in contenders(settings, calibrated):
             report_progress(f"{name}: {contender.peer or 'splatbot'} {contender.setting}".rstrip())
             add_rows(results, log, contender, run_log(log, contender.make(), settings.max_frames), name)

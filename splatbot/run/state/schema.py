@@ -30,12 +30,12 @@ from splatbot.optimize.adam import GaussianAdam
 from splatbot.slam import FrameResult, Slam
 from splatbot.tracking.budget import CostModel
 from splatbot.tracking.features import Features
+from splatbot.tracking.motion_filter import CameraMotion, MotionFilter
 from splatbot.tracking.motion_model import ConstantVelocity
 from splatbot.tracking.reference import Reference, ReferencePoints
 from splatbot.tracking.relocalization import PlaceSearch, RelocalizationCandidate
 from splatbot.tracking.tracker import Tracker
 from splatbot.tracking.uncertainty import Uncertainty
-from splatbot.tracking.velocity import CameraVelocity
 
 FORMAT_VERSION = 3
 """Version of the saved state. Version 1 names modules, classes and attributes of splatbot 0.1; 2 has one camera."""
@@ -51,6 +51,7 @@ class SavedType:
         transient: attributes that are not saved; ``create`` sets them.
         create: makes an object without saved fields. If None, the fields are all of its attributes.
         added: fields that earlier states of this format version lack. They keep the value of a new object.
+        removed: fields of earlier states that objects no longer have.
     """
 
     cls: type
@@ -58,6 +59,7 @@ class SavedType:
     transient: frozenset[str] = frozenset()
     create: Callable[[Config], object] | None = None
     added: frozenset[str] = frozenset()
+    removed: frozenset[str] = frozenset()
 
     def defaults(self) -> dict[str, Any]:
         """Return the default value of each added field of a dataclass."""
@@ -75,6 +77,10 @@ def _fields(*attributes: str) -> dict[str, str]:
     """Return attributes by field name: an attribute without underscore, or ``field=attribute``."""
     pairs = (text.split("=") for text in attributes)
     return {pair[0].lstrip("_"): pair[-1] for pair in pairs}
+
+
+class RemovedObject:
+    """Represents an object of an earlier state that this version does not use."""
 
 
 TYPES: Mapping[str, SavedType] = {
@@ -158,7 +164,7 @@ TYPES: Mapping[str, SavedType] = {
         _fields(
             "config",
             "motion",
-            "_velocity",
+            "_filter",
             "variance_scale",
             "_lost",
             "uncertainties=_keyframe_uncertainty",
@@ -169,14 +175,17 @@ TYPES: Mapping[str, SavedType] = {
         ),
         transient=frozenset({"_stages"}),
         create=lambda config: Tracker(config.tracking),
-        added=frozenset({"velocity", "variance_scale"}),
+        added=frozenset({"filter", "variance_scale"}),
+        removed=frozenset({"velocity"}),
     ),
     "motion_model": SavedType(
         ConstantVelocity,
         _fields("_last", "_twist", "_interval", "_dead_reckoning"),
         create=lambda _: ConstantVelocity(),
     ),
-    "camera_velocity": SavedType(CameraVelocity, _fields("_poses"), create=lambda _: CameraVelocity()),
+    "motion_filter": SavedType(MotionFilter, _fields("_state"), create=lambda _: MotionFilter()),
+    "camera_motion": _dataclass(CameraMotion),
+    "camera_velocity": SavedType(RemovedObject, _fields("poses"), create=lambda _: RemovedObject()),
     "frame_quality": SavedType(FrameQuality, _fields("_recent"), create=lambda _: FrameQuality()),
     "stage_costs": SavedType(CostModel, _fields("_frame", "_runs"), create=lambda _: CostModel()),
     "place_search": SavedType(PlaceSearch, _fields("_next"), create=lambda _: PlaceSearch()),

@@ -185,11 +185,13 @@ class Decoder:
             raise ValueError(f"{name} is not a type of a saved run")
         if self._version == 2:
             inner = {version_2_field(name, field): item for field, item in inner.items()}
-        different = (inner.keys() ^ TYPES[name].fields.keys()) - TYPES[name].added
+        saved = TYPES[name]
+        different = (inner.keys() ^ saved.fields.keys()) - saved.added - saved.removed
         if different:
             raise ValueError(f"{name} has other fields: {', '.join(sorted(different))}")
         value = self._known[index] = self._blank(name)
-        self._set(value, name, {field: self.decode(item) for field, item in inner.items()})
+        fields = {field: self.decode(item) for field, item in inner.items()}
+        self._set(value, name, {field: item for field, item in fields.items() if field not in saved.removed})
         return value
 
     def _object_of_version_1(self, tree: Tree, index: int) -> Any:

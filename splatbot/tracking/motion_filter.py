@@ -1,0 +1,160 @@
+"""Pose and velocity of the camera from frame to frame, by a Kalman filter on SE(3)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatbot.geometry import adjoint, inverse, se3_exp, se3_log
+from splatbot.tracking.align import Alignment
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class MotionFilterConstants:
+    """Constants of the motion of a camera on a hand or an arm."""
+
+    acceleration: float = 1.0
+    """Standard deviation [m/s²] of an acceleration that persists over ``correlation``. A larger value smooths less."""
+    angular_acceleration: float = 6.0
+    """Standard deviation [rad/s²] of such an angular acceleration."""
+    correlation: float = 0.1
+    """Time [s] over which an acceleration persists."""
+    speed: float = 1.0
+    """Standard deviation [m/s] of an unknown velocity, and of an unknown angular velocity in 2 [rad/s]."""
+    max_gap: float = 0.15
+    """Longest time [s] between two frames over which the acceleration of a hand is nearly constant. Over a longer one
+    the velocity is unknown."""
+
+
+CONSTANTS = MotionFilterConstants()
+
+_DAMPING = 1e-12  # variance [m², rad²] of a pose that is stated to be exact
+_BAND_DAMPING = 1e-3  # information [1/m², 1/rad²] of any pose, as in splatbot.tracking.uncertainty
+
+
+@dataclass(frozen=True, eq=False)
+class CameraMotion:
+    """Pose and velocity of the camera at one time.
+
+    Args:
+        stamp: time [s].
+        T_world_camera: (4, 4).
+        twist: (6,) velocity (translation [m/s], rotation [rad/s]) in the camera's frame.
+        covariance: (12, 12) of the errors x = (ξ, η): T_world_camera exp(ξ) is the true pose and twist + η the true
+            velocity.
+    """
+
+    stamp: float
+    T_world_camera: Array
+    twist: Array
+    covariance: Array
+
+    @classmethod
+    def at_pose(
+        cls, stamp: float, T_world_camera: Array, covariance: Array, twist: Array | None = None
+    ) -> CameraMotion:
+        """Return the state at a pose (4, 4) with a covariance (6, 6); the velocity is unknown, or known to a tenth."""
+        p, P = CONSTANTS, np.zeros((12, 12))
+        sigma = np.repeat([p.speed, 2 * p.speed], 3) * (1.0 if twist is None else 0.1)
+        P[:6, :6], P[6:, 6:] = covariance + _DAMPING * np.eye(6), np.diag(sigma**2)
+        return cls(stamp, T_world_camera, np.zeros(6) if twist is None else twist, P)
+
+    def predict(self, stamp: float) -> CameraMotion:
+        """Return the state at a later time [s] under white noise of acceleration.
+
+        Barfoot, "State estimation for robotics" (2017), section 11.1, with the step dt, the twist ϖ and the spectral
+        density S of the acceleration::
+
+            T ← T exp(dt ϖ)
+            F = [Ad(exp(-dt ϖ))  dt 1]      Q = [dt³/3 S  dt²/2 S]
+                [0                  1]          [dt²/2 S     dt S]
+            P ← F P Fᵀ + Q
+        """
+        p, dt = CONSTANTS, stamp - self.stamp
+        F = np.eye(12)
+        F[:6, :6], F[:6, 6:] = adjoint(se3_exp(-dt * self.twist)), dt * np.eye(6)
+        density = p.correlation * np.repeat([p.acceleration**2, p.angular_acceleration**2], 3)
+        Q = np.kron([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]], np.diag(density))
+        T = self.T_world_camera @ se3_exp(dt * self.twist)
+        return CameraMotion(stamp, T, self.twist, F @ self.covariance @ F.T + Q)
+
+    def measure(self, alignment: Alignment, covariance: Array, used: Array, readout: float) -> CameraMotion:
+        """Return the state after the alignment of a frame, which measures the pose and, by its rows, the velocity.
+
+        The residuals of a rectified image depend on the pose and on the error of its twist. Row s, s seconds after the
+        stamp, sees a point moved by -(ξ + s η). With the normal equations (H_b, g_b) of bands of rows at times s_b::
+
+            information = [Σ H_b      Σ s_b H_b ] / k     gradient = [0            ] / k
+                          [Σ s_b H_b  Σ s_b² H_b]                    [Σ s_b g_b]
+
+        The factor k scales their pose to its covariance Σ, which is larger because residuals are correlated:
+        k⁶ = det(Σ) det(Σ_b H_b). Without rows the information is that of the pose, Σ⁻¹.
+
+        Args:
+            alignment: alignment of the rectified image.
+            covariance: (6, 6) of its pose.
+            used: (6,) twist [m/s, rad/s] with which the image was rectified.
+            readout: time from the first row to the last [s].
+        """
+        information, gradient = np.zeros((12, 12)), np.zeros(12)
+        n, H = len(alignment.band_gradient), alignment.band_information
+        total = H.sum(0) + _BAND_DAMPING * np.eye(6)
+        covariance = covariance + _DAMPING * np.eye(6)
+        if readout > 0 and n > 0 and np.isfinite(total).all() and np.isfinite(alignment.band_gradient).all():
+            s = ((np.arange(n) + 0.5) / n - 0.5) * readout
+            H1, H2 = np.einsum("b,bij->ij", s, H), np.einsum("b,bij->ij", s**2, H)
+            log_k = np.linalg.slogdet(covariance)[1] + np.linalg.slogdet(total)[1]
+            k = np.exp(max(float(log_k), 0.0) / 6)
+            information = np.block([[total, H1], [H1, H2]]) / k
+            gradient[6:] = s @ alignment.band_gradient / k
+        else:
+            information[:6, :6] = np.linalg.inv(covariance)
+        moved = se3_log(inverse(self.T_world_camera) @ alignment.T_world_camera)
+        at = np.concatenate([moved, used - self.twist])
+        P = np.linalg.inv(np.linalg.inv(self.covariance) + information)
+        x = P @ (information @ at + gradient)
+        return CameraMotion(self.stamp, self.T_world_camera @ se3_exp(x[:6]), self.twist + x[6:], 0.5 * (P + P.T))
+
+
+class MotionFilter:
+    """The motion of the camera by the poses of its frames.
+
+    Differences of noisy poses are no usable velocity: an error of the velocity displaces the rows of the next frame,
+    which displaces its pose. The filter weighs each pose and its rows against a motion with bounded acceleration.
+    """
+
+    def __init__(self) -> None:
+        self._state: CameraMotion | None = None
+
+    def predict(self, stamp: float) -> CameraMotion | None:
+        """Return the state at a time [s]; None at the start and over more than ``CONSTANTS.max_gap``."""
+        if self._state is None or not 0 < stamp - self._state.stamp <= CONSTANTS.max_gap:
+            return None
+        return self._state.predict(stamp)
+
+    def twist_at(self, stamp: float) -> Array:
+        """Return the expected twist (6,) [m/s, rad/s] at a time [s], zero where the motion is unknown."""
+        state = self.predict(stamp)
+        return np.zeros(6) if state is None else state.twist
+
+    def update(self, state: CameraMotion) -> None:
+        """Replace the state."""
+        self._state = state
+
+    def move(self, T_new_old: Array) -> None:
+        """Move the pose with a correction (4, 4) of the map; the velocity stays."""
+        if self._state is not None:
+            self._state = replace(self._state, T_world_camera=T_new_old @ self._state.T_world_camera)
+
+    def forget(self) -> None:
+        """Discard the motion, after a lost frame."""
+        self._state = None
+
+
+def mean_twist(T_first_second: Array, seconds: float) -> Array:
+    """Return the mean twist (6,) [m/s, rad/s] of a motion (4, 4); zero over more than ``CONSTANTS.max_gap``."""
+    return se3_log(T_first_second) / seconds if 0 < seconds <= CONSTANTS.max_gap else np.zeros(6)
