@@ -24,7 +24,7 @@ _MOST_OBJECTS = 500  # of a result, which stays in memory
 
 
 @dataclass(frozen=True)
-class MapState:
+class StateOfMap:
     """A state of a map: one of its versions, or, without ``version``, the map as it is when the work begins."""
 
     served: ServedMap
@@ -52,7 +52,7 @@ class MapState:
 
 def find_states(
     runtime: Runtime, served: ServedMap, number: int | None, other: str, other_number: int | None
-) -> tuple[MapState, MapState]:
+) -> tuple[StateOfMap, StateOfMap]:
     """Find two states, and check that they can be merged or compared.
 
     Raises:
@@ -65,7 +65,7 @@ def find_states(
     """
     b = runtime.store.get(other)
     states = tuple(
-        MapState(one, None if n is None else runtime.history.versions.get(one.id, n))
+        StateOfMap(one, None if n is None else runtime.history.versions.get(one.id, n))
         for one, n in ((served, number), (b, other_number))
     )
     if states[0].names() == states[1].names():
@@ -80,7 +80,7 @@ def find_states(
     return states[0], states[1]
 
 
-def merge_maps(runtime: Runtime, made: ServedMap, a: MapState, b: MapState) -> Work:
+def merge_maps(runtime: Runtime, made: ServedMap, a: StateOfMap, b: StateOfMap) -> Work:
     """Return the work of a job that merges B into the world of A, as the map ``made``; a failure removes that map."""
 
     def work(handle: JobHandle) -> dict[str, Any]:
@@ -93,7 +93,7 @@ def merge_maps(runtime: Runtime, made: ServedMap, a: MapState, b: MapState) -> W
     return work
 
 
-def compare_maps(runtime: Runtime, a: MapState, b: MapState, *, aligned: bool | None) -> Work:
+def compare_maps(runtime: Runtime, a: StateOfMap, b: StateOfMap, *, aligned: bool | None) -> Work:
     """Return the work of a job that finds the objects that differ between A and B, in the world of A.
 
     Args:
@@ -116,7 +116,7 @@ def compare_maps(runtime: Runtime, a: MapState, b: MapState, *, aligned: bool | 
     return work
 
 
-def _merge(runtime: Runtime, made: ServedMap, a: MapState, b: MapState, handle: JobHandle) -> dict[str, Any]:
+def _merge(runtime: Runtime, made: ServedMap, a: StateOfMap, b: StateOfMap, handle: JobHandle) -> dict[str, Any]:
     run_a, run_b = _load(runtime, a, b, handle)
 
     def located(share: float) -> None:
@@ -142,7 +142,7 @@ def _merge(runtime: Runtime, made: ServedMap, a: MapState, b: MapState, handle: 
     }
 
 
-def _load(runtime: Runtime, a: MapState, b: MapState, handle: JobHandle) -> tuple[SavedRun, SavedRun]:
+def _load(runtime: Runtime, a: StateOfMap, b: StateOfMap, handle: JobHandle) -> tuple[SavedRun, SavedRun]:
     """Load the mapper's states of A and B, and check their size before work begins on them."""
     handle.report(0.0, "reading the maps")
     with ExitStack() as stack:
@@ -189,7 +189,7 @@ def _publish(runtime: Runtime, made: ServedMap, slam: Slam) -> int | None:
         raise JobCancelled from error
 
 
-def _names(a: MapState, b: MapState) -> dict[str, Any]:
+def _names(a: StateOfMap, b: StateOfMap) -> dict[str, Any]:
     (map_a, number_a), (map_b, number_b) = a.names(), b.names()
     return {"map": map_a, "version": number_a, "other": map_b, "other_version": number_b}
 
