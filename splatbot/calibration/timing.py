@@ -70,8 +70,8 @@ def with_estimated_timing(
 ) -> tuple[Config, SensorTiming | None]:
     """Return the configuration with the times of the sensor, and the times, if the log reveals them.
 
-    Nothing is estimated if the configuration or the log states one of the times. Nor is it for simulated logs, for
-    several cameras, and for a camera that turns slowly.
+    Nothing is estimated if the configuration or the log states one of the times. Simulated logs, logs of several
+    cameras, and a camera that turns slowly keep the configuration, too.
 
     Args:
         config: configuration, with the sensor of the log's camera file.

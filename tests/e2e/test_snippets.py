@@ -25,6 +25,7 @@ from splatbot.grasping.affordance import NameHint, find_target
 from splatbot.grasping.language import LanguageAffordance
 from splatbot.grasping.pick import Picker
 from splatbot.grasping.sampler import GraspSampler
+from splatbot.logs import open_log
 from splatbot.planning import certify_motion, time_path
 from splatbot.robots.controllers import FakeController
 from splatbot.robots.grippers import FakeGripper
@@ -104,6 +105,11 @@ def _planning(desk: Path) -> Names:
     return names | {"here": panda().home, "controller": FakeController(panda().home)}
 
 
+def _tiles(desk: Path) -> Names:
+    assert main(["tile", str(desk / "runs" / "desk"), "--out", str(desk / "building-tiles")]) == 0
+    return {"camera": open_log(LOG).camera, "T_world_camera": np.eye(4)}
+
+
 def _tracking(desk: Path) -> Names:
     return {"replace": replace, "PosePrior": PosePrior, "covariance": 1e-4 * np.eye(6), "T": np.eye(4)}
 
@@ -115,6 +121,7 @@ CONTEXTS: dict[str, Callable[[Path], Names]] = {
     "docs/guide/merging.md": _merging,
     "docs/guide/picking.md": _picking,
     "docs/guide/planning.md": _planning,
+    "docs/guide/tiles.md": _tiles,
     "docs/guide/tracking.md": _tracking,
 }
 RESULTS: dict[str, Callable[[Names], bool]] = {
@@ -122,6 +129,7 @@ RESULTS: dict[str, Callable[[Names], bool]] = {
     "docs/guide/grasping.md": lambda names: 0.0 < names["grasp"].width < 0.08,
     "docs/guide/picking.md": lambda names: names["result"].grasp is not None,
     "docs/guide/planning.md": lambda names: names["followed"].state == "done",
+    "docs/guide/tiles.md": lambda names: names["image"].std() > 0.05,
     "docs/guide/tracking.md": lambda names: names["result"].verdict == "ok" and names["frame"].prior is not None,
     "docs/guide/twin.md": lambda names: names["result"].steps > 1000,
 }
