@@ -100,8 +100,7 @@ def _measure(settings: TrackingSettings, report_progress: ReportProgress) -> Res
 def _plot(results: Results, folder: Path) -> None:
     from splatbot.bench.tracking.plots import plot_tracking
 
-    if any(not row.case.startswith(STRESS) for row in results.rows):
-        plot_tracking(results, folder)
+    plot_tracking(results, folder)
 
 
 BENCHMARK = Benchmark(

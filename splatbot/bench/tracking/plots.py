@@ -17,11 +17,16 @@ DEFAULT_SETTINGS = ("default", "100 ms")
 
 
 def plot_tracking(results: Results, out: Path) -> None:
-    """Write ``tracking.png``, ``.svg``: ATE against the median of milliseconds; ours joined, the default marked."""
-    logs = list(dict.fromkeys(row.case.partition(",")[0] for row in results.rows))
-    figure, axes = plt.subplots(1, max(1, len(logs)), figsize=(4.6 * max(1, len(logs)), 3.8), squeeze=False)
-    for axis, log in zip(axes[0], logs, strict=False):
-        points = _points(results, log)
+    """Write ``tracking.png``, ``.svg``: ATE against the median of milliseconds; ours joined, the default marked.
+
+    Stress cases and logs whose runs have no error above 0 have no panel.
+    """
+    names = dict.fromkeys(row.case.partition(",")[0] for row in results.rows)
+    panels = {name: points for name in names if (points := _points(results, name))}
+    if not panels:
+        return
+    figure, axes = plt.subplots(1, len(panels), figsize=(4.6 * len(panels), 3.8), squeeze=False)
+    for axis, (log, points) in zip(axes[0], panels.items(), strict=True):
         ours = sorted((ms, error) for peer, _, ms, error in points if peer is None)
         axis.plot([ms for ms, _ in ours], [error for _, error in ours], "o-", color="#2a6f97", label="splatbot")
         for peer, setting, ms, error in points:
@@ -57,9 +62,9 @@ def _points(results: Results, log: str) -> list[tuple[str | None, str, float, fl
     points = []
     for row in results.rows:
         name, _, setting = row.case.partition(", ")
-        if name != log or row.metric != "ATE" or row.value is None:
+        if name != log or row.metric != "ATE" or row.value is None or row.value <= 0:
             continue
         ms = results.find(row.case, "p50", row.peer)
-        if ms is not None:
+        if ms is not None and ms > 0:
             points.append((row.peer, setting, ms, row.value))
     return points

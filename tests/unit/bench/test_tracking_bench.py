@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatbot.bench.results import Results
+from splatbot.bench.results import Results, Row
 from splatbot.bench.tracking import ATE, BENCHMARK, LOST, NEES, RESIDENT, RPE, TRACKED, TrackingSettings
 from splatbot.bench.tracking.accuracy import run_log
 from splatbot.bench.tracking.peers import TrackingPeer, tracking_peers
+from splatbot.bench.tracking.plots import plot_tracking
 from splatbot.cli import main
 from splatbot.evaluation import absolute_error
 from splatbot.frame import Frame
@@ -114,3 +115,16 @@ def test_the_command_prints_the_table_and_writes_to_the_given_files(
 def test_wrong_input_is_reported_before_anything_runs(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "tracking", *words]) == 2
     assert "Fix:" in capsys.readouterr().err
+
+
+def test_cases_without_an_error_above_0_have_no_panel_and_do_not_end_the_benchmark(tmp_path: Path) -> None:
+    stress = [
+        Row("stress: corridor", ATE, 0.7, "mm"),
+        Row("still, 100 ms", ATE, 0.0, "mm"),
+        Row("still, 100 ms", "p50", 5.0, "ms"),
+    ]
+    plot_tracking(Results({}, stress), tmp_path)
+    assert not list(tmp_path.iterdir())
+    moving = [Row("desk, 100 ms", ATE, 3.0, "mm"), Row("desk, 100 ms", "p50", 40.0, "ms")]
+    plot_tracking(Results({}, stress + moving), tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {"tracking.png", "tracking.svg"}
