@@ -93,7 +93,7 @@ def example(body: dict[str, Any]) -> dict[int | str, dict[str, Any]]:
 
 def etag(served: ServedMap, what: str = "") -> str:
     """Return the entity tag of a representation of one map version."""
-    key = f"{_PROCESS} {served.id} {served.map_version} {served.state} {what}"
+    key = f"{_PROCESS} {served.id} {served.generation} {served.map_version} {served.state} {what}"
     return f'"{hashlib.sha256(key.encode()).hexdigest()[:20]}"'
 
 

@@ -6,6 +6,7 @@ import logging
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -22,7 +23,7 @@ from splatbot.services.quotas import Quotas
 from splatbot.services.scratch import Scratch
 from splatbot.services.store import MapStore, ServedMap
 from splatbot.services.version_index import Version
-from splatbot.services.versions import Versions, VersionsOffError, read_version, save_slam
+from splatbot.services.versions import Versions, VersionsOffError, note_of_repeat, read_version, save_slam
 from splatbot.slam import Slam
 from splatbot.trajectory import Trajectory
 
@@ -147,17 +148,24 @@ class MapHistory:
                 self._save(now, _slam(mapping), owner=owner, note=f"before version {number} again")
             saved = read_version(version, folder)
             slam = None if mapping is None else self._slam_of(version, folder)
-            with self._disk:
+            with self._disk, ExitStack() as undo:
                 now = self._store.get(served.id, generation=served.generation)
-                snapshot = Snapshot(saved["snapshot"].model, 1 + now.map_version, saved["snapshot"].stamp)
-                path = saved["trajectory"] or Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
+                map_version = 1 + now.map_version
+                snapshot = Snapshot(saved["snapshot"].model, map_version, saved["snapshot"].stamp)
+                path = saved["trajectory"]
+                if path is None and now.trajectory is not None:
+                    path = Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
                 if mapping is not None and slam is not None:
-                    rolled_back(slam, 1 + max(now.map_version, mapping.mapper.snapshot().map_version))
+                    undo.callback(slam.close)
+                    map_version = 1 + max(now.map_version, mapping.mapper.snapshot().map_version)
+                    rolled_back(slam, map_version)
                     snapshot, path = slam.snapshot(), slam.trajectory
-                made = self.versions.repeat(version, owner=owner, map_version=snapshot.map_version)
+                moved = slam if snapshot.map_version > map_version else None  # by a loop closure that was pending
+                made = self._record(version, replace(now, snapshot=snapshot, trajectory=path), moved, owner=owner)
                 self._store.publish(served.id, snapshot, path, generation=served.generation)
                 if mapping is not None and slam is not None:
                     mapping.go_on_with(slam)
+                undo.pop_all()
         self._keep(served)
         return made
 
@@ -221,6 +229,14 @@ class MapHistory:
                 self._library.save(now)
             check = partial(self._quotas.check_bytes, owner)
             return self.versions.save(now, slam, owner=owner, label=label, note=note, check=check)
+
+    def _record(self, version: Version, now: ServedMap, moved: Slam | None, *, owner: str) -> Version:
+        """Record the return to a version, with files of its own if the mapper has moved the map since it was loaded."""
+        check = partial(self._quotas.check_bytes, owner)
+        if moved is None:
+            return self.versions.repeat(version, owner=owner, map_version=now.map_version, check=check)
+        note = note_of_repeat(version)
+        return self.versions.save(now, moved, owner=owner, note=note, check=check, restored_from=version)
 
     def _keep(self, served: ServedMap) -> None:
         """Save the map; a failure is counted, and the service tries again later."""

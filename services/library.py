@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import hashlib
 import json
 import logging
 import os
@@ -259,7 +260,13 @@ def _read(folder: Path) -> dict[str, Any]:
     found = read_map(folder)
     if folder.name != f"v{found['snapshot'].map_version}":
         raise FormatError("belongs to another folder.", file=folder / "map.json", hint=_HINT)
-    return found
+    return {"world": _world_of_old(folder), **found}
+
+
+def _world_of_old(folder: Path) -> str:
+    """Return the name of the world of a state that was saved without one, the same at each start."""
+    content = (folder / "map.json").read_bytes()
+    return hashlib.sha256(f"{folder.parent.name}\n".encode() + content).hexdigest()[:16]
 
 
 def read_map(folder: Path) -> dict[str, Any]:

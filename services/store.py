@@ -241,7 +241,7 @@ class MapStore:
             current = self._find(map_id, generation)
             if current.snapshot is not None and snapshot.map_version <= current.map_version:
                 return
-            later = trajectory or current.trajectory
+            later = trajectory if trajectory is not None else current.trajectory
             self._put(replace(current, snapshot=snapshot, trajectory=later, derived=Derived()))
             if trajectory is not None:
                 self.bus.publish(map_topic(map_id, TRAJECTORY), trajectory)

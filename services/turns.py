@@ -10,19 +10,26 @@ from splatbot.services.problems import BusyError
 
 
 class Turns:
-    """Gives one thread at a time the mapper. A thread that waits between frames comes before the next frame."""
+    """Gives one thread at a time the mapper.
+
+    A thread that waits between frames comes before the next frame. After its turn, a frame that waits comes first.
+    """
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
-        self._taken = False
-        self._between = 0
+        self._taken = self._frame_first = False
+        self._frames = self._between = 0  # that wait
 
     @contextmanager
     def frame(self) -> Iterator[None]:
         """Enter while a frame is mapped."""
         with self._changed:
-            self._changed.wait_for(lambda: not self._taken and not self._between)
-            self._taken = True
+            self._frames += 1
+            try:
+                self._changed.wait_for(lambda: not self._taken and (self._frame_first or not self._between))
+                self._taken, self._frame_first = True, False
+            finally:
+                self._frames -= 1
         try:
             yield
         finally:
@@ -38,8 +45,9 @@ class Turns:
         with self._changed:
             self._between += 1
             try:
-                free = self._changed.wait_for(lambda: not self._taken, timeout_s)
+                free = self._changed.wait_for(lambda: not self._taken and not self._frame_is_next, timeout_s)
                 self._taken = self._taken or free
+                self._frame_first = self._frame_first or free
             finally:
                 self._between -= 1
                 self._changed.notify_all()
@@ -49,6 +57,10 @@ class Turns:
             yield
         finally:
             self._leave()
+
+    @property
+    def _frame_is_next(self) -> bool:
+        return self._frame_first and self._frames > 0
 
     def _leave(self) -> None:
         with self._changed:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import sqlite3
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 from urllib.parse import quote
 
 from splatbot import failpoints
+from splatbot.atomic import sync
 from splatbot.errors import FormatError
 from splatbot.services.problems import SaveError
 
@@ -69,24 +70,28 @@ class Version:
 
 _COLUMNS = ", ".join(field.name for field in fields(Version))
 _PLACES = ", ".join("?" for _ in fields(Version))
+_DELETE = "DELETE FROM versions WHERE map = ? AND number = ?"
 
 
 class VersionIndex:
     """Rows of the index, which are read once and held in memory; any thread may read, and one at a time writes.
 
     Args:
-        path: of the file, which is created if it does not exist.
+        path: of the file.
+        create: whether to create the file if it is missing or empty.
 
     Raises:
-        FormatError: the file is damaged, or of a later version of splatbot.
+        FormatError: the file is damaged, of a later version of splatbot, or missing and not to be created.
         SaveError: it cannot be read or written.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, create: bool = True) -> None:
         self._path = path
         self._reserve = path.with_name("reserve")
         self._lock = threading.Lock()
-        with self._connected(create=True) as db:
+        if not create and not (path.is_file() and path.stat().st_size):
+            raise FormatError("is missing or empty, and there are files of versions.", file=path, hint=_HINT)
+        with self._connected(create=create) as db:
             db.execute("PRAGMA journal_mode=WAL")
             (found,) = db.execute("PRAGMA quick_check").fetchone()
             if found != "ok":
@@ -95,6 +100,8 @@ class VersionIndex:
             if schema > SCHEMA:
                 hint = "start the splatbot that wrote it, or a later one"
                 raise FormatError(f"has schema {schema}, this splatbot reads {SCHEMA}.", file=path, hint=hint)
+            if schema == 0 and not create:
+                raise FormatError("holds no index, and there are files of versions.", file=path, hint=_HINT)
             if schema == 0:
                 db.executescript(f"BEGIN IMMEDIATE; {_TABLES} PRAGMA user_version={SCHEMA}; COMMIT;")
             self._versions = [Version(*row) for row in db.execute(f"SELECT {_COLUMNS} FROM versions ORDER BY rowid")]
@@ -112,18 +119,19 @@ class VersionIndex:
         """Return the number of the map's next version."""
         return 1 + self._latest.get(map_id, 0)
 
-    def add(self, version: Version) -> None:
-        """Add a version."""
+    def add(self, version: Version, *, instead_of: Sequence[Version] = ()) -> None:
+        """Add a version and remove others, in one transaction."""
         with self._writing() as db:
+            db.executemany(_DELETE, [(gone.map, gone.number) for gone in instead_of])
             db.execute(f"INSERT INTO versions ({_COLUMNS}) VALUES ({_PLACES})", astuple(version))
             db.execute("INSERT OR REPLACE INTO numbers VALUES (?, ?)", (version.map, version.number))
         self._latest[version.map] = version.number
-        self._versions = [*self._versions, version]
+        self._versions = [*(other for other in self._versions if other not in instead_of), version]
 
     def remove(self, version: Version) -> None:
         """Remove a version, also on a full disk."""
         with self._writing(in_reserve=True) as db:
-            db.execute("DELETE FROM versions WHERE map = ? AND number = ?", (version.map, version.number))
+            db.execute(_DELETE, (version.map, version.number))
         self._versions = [other for other in self._versions if other != version]
 
     def remove_map(self, map_id: str) -> None:
@@ -138,9 +146,15 @@ class VersionIndex:
 
     def keep_reserve(self) -> None:
         """Keep space on the disk in which versions can be removed once it is full, if there is any."""
-        with suppress(OSError):
-            if not self._reserve.exists():
-                self._reserve.write_bytes(bytes(_RESERVE_BYTES))
+        try:
+            if self._reserve.is_file() and self._reserve.stat().st_size == _RESERVE_BYTES:
+                return
+            with self._reserve.open("wb") as file:
+                file.write(bytes(_RESERVE_BYTES))
+                sync(file)
+        except OSError:  # a part of it would hold space that versions need
+            with suppress(OSError):
+                self._reserve.unlink(missing_ok=True)
 
     @contextmanager
     def _connected(self, *, create: bool = False) -> Iterator[sqlite3.Connection]:

@@ -11,7 +11,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -37,6 +37,11 @@ FOLDER = ".versions"
 _MAP = "map"  # next to the folder `state` of the mapper
 _FILES = re.compile(r"[0-9a-f]{16}")
 _DRAFT = ".draft"
+_UNNAMED = ".unnamed"
+
+
+def _any_size(_size: int) -> None:
+    """Accept every size."""
 
 
 class VersionNotFoundError(InputError):
@@ -71,8 +76,8 @@ class Versions:
     """Versions of all maps: immutable files below ``files``, and the index ``index.sqlite``.
 
     The files of a version are complete and on the disk before the index names them. A deleted version leaves the index
-    before its files go. So a process that is killed leaves at most files that no version names, and the next start
-    removes them. The process must own the folder.
+    before its files go. So a process that is killed leaves at most files that no version names. The next start removes
+    drafts, and sets whole folders aside as ``NAME.unnamed``. The process must own the folder.
 
     Args:
         folder: created if it does not exist.
@@ -81,7 +86,7 @@ class Versions:
         served: returns the present state of a map; None if there is no such map.
 
     Raises:
-        FormatError: the index is damaged.
+        FormatError: the index is damaged, or missing while there are files of versions.
         SaveError: the folder cannot be written to.
     """
 
@@ -95,10 +100,11 @@ class Versions:
         self._pins: Counter[str] = Counter()  # of folders
         try:
             self.files.mkdir(parents=True, exist_ok=True)
+            is_new = not any(_FILES.fullmatch(path.name) for path in self.files.iterdir())
+            self._index = VersionIndex(folder / "index.sqlite", create=is_new)
+            self._sweep()
         except OSError as error:
             raise disk_error(error) from error
-        self._index = VersionIndex(folder / "index.sqlite")
-        self._sweep()
         self._count_bytes()
 
     def of_map(self, map_id: str) -> list[Version]:
@@ -133,7 +139,8 @@ class Versions:
         owner: str,
         label: str | None = None,
         note: str | None = None,
-        check: Callable[[int], None] = lambda _size: None,
+        check: Callable[[int], None] = _any_size,
+        restored_from: Version | None = None,
     ) -> Version:
         """Save the present state of a map as a new version.
 
@@ -142,7 +149,9 @@ class Versions:
             slam: its mapper between two frames. If None, nothing maps it.
             owner: client whose quota the version counts in.
             label, note: texts of the client.
-            check: called with the size [bytes] before the version is there; its errors prevent the version.
+            check: called with the size [bytes] of files that are new to the owner, before the version is there; its
+                errors prevent the version.
+            restored_from: version of which the state is made, if any.
 
         Raises:
             MapNotReadyError: the map has no state.
@@ -162,16 +171,18 @@ class Versions:
             world=served.world,
             map_version=served.map_version,
             gaussians=len(snapshot.model),
-            keyframes=len(slam.keyframes) if slam is not None else 0,
+            keyframes=0,
             bytes=0,
             checksum="",
             folder="",
             parent=earlier[-1].number if earlier else None,
             restored_from=None,
         )
+        if restored_from is not None:
+            version = replace(version, parent=restored_from.number, restored_from=restored_from.number)
         if known is not None:
             shared = {name: getattr(known, name) for name in ("keyframes", "bytes", "checksum", "folder")}
-            return self._add(replace(version, **shared))
+            return self._add(replace(version, **shared), check)
         name = secrets.token_hex(8)
         draft = self.files / f"{name}{_DRAFT}"
         try:
@@ -179,11 +190,8 @@ class Versions:
             write_map(served, snapshot, draft / _MAP)
             if slam is not None:
                 save_slam(slam, draft, served.source)
-            size = _size_of(draft)
-            check(size)
-            version = replace(version, bytes=size, checksum=_checksum(draft), folder=name)
-            with self._lock:
-                self._make_room(version, size)
+                version = replace(version, keyframes=len(slam.keyframes))  # none is on its way after the save
+            version = replace(version, bytes=_size_of(draft), checksum=_checksum(draft), folder=name)
             sync_folder(draft)
             rename(draft, self.files / name)
         except OSError as error:
@@ -191,31 +199,37 @@ class Versions:
         finally:
             shutil.rmtree(draft, ignore_errors=True)
         try:
-            return self._add(version)
+            return self._add(version, check)
         except SplatbotError:
             self._remove_files(name)
             raise
 
-    def repeat(self, version: Version, *, owner: str, map_version: int) -> Version:
+    def repeat(
+        self, version: Version, *, owner: str, map_version: int, check: Callable[[int], None] = _any_size
+    ) -> Version:
         """Record that a map went back to a version: a new version that shares its files.
+
+        Args:
+            version: the version.
+            owner: client whose quota the new version counts in.
+            map_version: of the restored state.
+            check: as for :meth:`save`.
 
         Raises:
             VersionsFullError: there is no room for another version.
             SaveError: the index cannot be written.
         """
-        note = f"version {version.number} again"
-        return self._add(
-            replace(
-                version,
-                created=time.time(),
-                label=None,
-                note=note,
-                owner=owner,
-                map_version=map_version,
-                parent=version.number,
-                restored_from=version.number,
-            )
+        repeated = replace(
+            version,
+            created=time.time(),
+            label=None,
+            note=note_of_repeat(version),
+            owner=owner,
+            map_version=map_version,
+            parent=version.number,
+            restored_from=version.number,
         )
+        return self._add(repeated, check)
 
     def delete(self, version: Version) -> None:
         """Delete a version.
@@ -231,7 +245,9 @@ class Versions:
             if self._is_in_use(version):
                 hint = "restore another version first, or delete the map"
                 raise VersionInUseError(f"the map answers from version {version.number}.", field="version", hint=hint)
-            self._drop(version)
+            self._index.remove(version)
+            self._remove_files(version.folder)
+            self._count_bytes()
 
     def remove_map(self, map_id: str) -> None:
         """Remove all versions of a map; files that a request reads go when it ends.
@@ -269,52 +285,62 @@ class Versions:
                 self._pins[version.folder] -= 1
                 self._remove_files(version.folder)
 
-    def _add(self, version: Version) -> Version:
-        """Add a version whose files are there, under the next number."""
+    def _add(self, version: Version, check: Callable[[int], None]) -> Version:
+        """Add a version whose files are there, under the next number, in place of those that make room for it."""
         with self._lock:
-            self._make_room(version, 0)
+            every = self._index.every()
+            if all((other.owner, other.folder) != (version.owner, version.folder) for other in every):
+                check(version.bytes)
+            gone = self._making_room(version)
             version = replace(version, number=self._index.next_number(version.map))
-            self._index.add(version)
+            self._index.add(version, instead_of=gone)
+            for other in gone:
+                _log.info("version %d of map %s makes room", other.number, other.map)
+                self._remove_files(other.folder)
             self._count_bytes()
         return version
 
-    def _make_room(self, version: Version, size: int) -> None:
-        """Delete the oldest versions without a label until a version of ``size`` bytes fits.
+    def _making_room(self, version: Version) -> list[Version]:
+        """Choose the oldest versions without a label whose removal lets a version fit, and remove none.
 
-        Those of the same map make room for its number, and those of the same client for its bytes.
+        Those of the same map make room for its number, and those of the same client for its bytes. Files that other
+        versions share make no room.
 
         Raises:
             VersionsFullError: the others have labels or are in use.
         """
-        while len(own := self.of_map(version.map)) >= self._most:
-            self._drop_oldest(own, f"map {version.map!r} has {len(own)} versions already.", "SPLATBOT_MAX_VERSIONS")
-        while _total(every := self._index.every()) + size > self._most_bytes:
-            own = [v for v in every if v.owner == version.owner]
-            why = f"the versions have {_total(every)} bytes already, and this one has {size}."
-            self._drop_oldest(own, why, "SPLATBOT_MAX_VERSIONS_BYTES")
-
-    def _drop_oldest(self, versions: list[Version], why: str, setting: str) -> None:
-        free = (v for v in versions if v.label is None and not self._pins[v.folder] and not self._is_in_use(v))
-        oldest = next(free, None)
-        if oldest is None:
-            hint = f"delete a version, or raise {setting}"
-            raise VersionsFullError(why, field="versions", hint=hint)
-        _log.info("version %d of map %s makes room", oldest.number, oldest.map)
-        self._drop(oldest)
+        every = self._index.every()
+        free = [v for v in every if v.label is None and not self._pins[v.folder] and not self._is_in_use(v)]
+        own, of_map = self.of_map(version.map), [v for v in free if v.map == version.map]
+        surplus = max(0, len(own) + 1 - self._most)
+        gone = of_map[:surplus]
+        if len(gone) < surplus:
+            raise _full(f"map {version.map!r} has {len(own)} versions already.", "SPLATBOT_MAX_VERSIONS")
+        kept = [v for v in every if v not in gone]
+        removable = [v for v in free if v in kept and v.owner == version.owner]
+        for folder in dict.fromkeys(v.folder for v in removable):
+            if _total([*kept, version]) <= self._most_bytes:
+                break
+            sharing = [v for v in kept if v.folder == folder]
+            if folder != version.folder and all(v in removable for v in sharing):
+                gone += sharing
+                kept = [v for v in kept if v not in sharing]
+        if _total([*kept, version]) > self._most_bytes:
+            why = f"the versions have {_total(every)} bytes already, and this one has {version.bytes}."
+            raise _full(why, "SPLATBOT_MAX_VERSIONS_BYTES")
+        return gone
 
     def _is_in_use(self, version: Version) -> bool:
         served = self._served(version.map)
         return served is not None and self.in_use(served) == version
 
-    def _drop(self, version: Version) -> None:
-        self._index.remove(version)
-        self._remove_files(version.folder)
-        self._count_bytes()
-
     def _remove_files(self, name: str) -> None:
         """Remove files that no version names any more, and no request reads."""
         if not self._pins[name] and all(version.folder != name for version in self._index.every()):
-            shutil.rmtree(self.files / name, ignore_errors=True)
+            draft = self.files / f"{name}{_DRAFT}"  # a kill during the removal leaves a draft, which a start removes
+            with suppress(OSError):
+                (self.files / name).rename(draft)
+            shutil.rmtree(draft, ignore_errors=True)
 
     def _count_bytes(self) -> None:
         """Count the bytes of each client after a change."""
@@ -323,11 +349,19 @@ class Versions:
         self._bytes = Counter({o: _total([v for v in every if v.owner == o]) for o in {v.owner for v in every}})
 
     def _sweep(self) -> None:
-        """Remove the remains of a killed process: drafts, and files that no version names."""
+        """Remove the drafts of a killed process, and set whole folders aside that no version names."""
         named = {version.folder for version in self._index.every()}
         for path in self.files.iterdir():
-            if path.name not in named and _FILES.fullmatch(path.name.removesuffix(_DRAFT)):
+            if path.name.endswith(_DRAFT):
                 shutil.rmtree(path, ignore_errors=True)
+            elif path.name not in named and _FILES.fullmatch(path.name):
+                _log.error("%s is named by no version and set aside", path)
+                rename(path, path.with_name(f"{path.name}{_UNNAMED}"))
+
+
+def note_of_repeat(version: Version) -> str:
+    """Return the note of a version that records the return to another one."""
+    return f"version {version.number} again"
 
 
 def read_version(version: Version, folder: Path) -> dict[str, Any]:
@@ -362,6 +396,10 @@ def _check(version: Version, folder: Path) -> None:
             check_folder(part)
     except (InputError, OSError) as error:
         raise _damaged(version, error) from error
+
+
+def _full(why: str, setting: str) -> VersionsFullError:
+    return VersionsFullError(why, field="versions", hint=f"delete a version, or raise {setting}")
 
 
 def _damaged(version: Version, error: Exception) -> DamagedVersionError:

@@ -89,8 +89,11 @@ def diff(
     world of this map. `T_a_b` is the pose of the other map. The maps do not change; a map that grows is read between
     two frames.
     """
-    a, b = find_states(service, served, query.version, query.other, query.other_version)
     request = f"diff {served.id} {query.model_dump_json()}"
+    known = service.jobs.known(key, request)
+    if known is not None:
+        return accepted(known)
+    a, b = find_states(service, served, query.version, query.other, query.other_version)
     work = compare_maps(service, a, b, aligned=query.aligned)
     job, _ = service.jobs.submit("diff", work, key=key, request=request, client=caller)
     return accepted(job)

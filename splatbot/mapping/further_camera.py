@@ -181,6 +181,10 @@ class FreeCamera:
 
     def __init__(self, config: Config) -> None:
         self.tracker = Tracker(config.tracking)
+        self.forget()
+
+    def forget(self) -> None:
+        """Discard pose and confirmation: the camera may be anywhere in the map, and is searched at the next frame."""
         self.tracker.forget()
         self.anchor: int | None = None
         self._confirmed = 0

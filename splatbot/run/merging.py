@@ -290,6 +290,7 @@ def merged_slam(
     mapper.keyframes = [*(without_contradicted(k, keyframes_b) for k in a.slam.keyframes), *keyframes_b]
     mapper.model, mapper.loops = joined.model, a.slam._mapper.loops
     mapper._refiner.adam.extend(joined.model)
+    mapper._stamp = b.slam.snapshot().stamp + time_offset
     return slam, joined
 
 

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from splatbot.mapping.further_camera import FreeCamera
 from splatbot.slam import Slam
 
 
 def rolled_back(slam: Slam, map_version: int) -> Slam:
     """Return the SLAM of a saved state, ready for frames of a later time.
 
-    The camera has moved since the state was saved, so the next frame may be anywhere in the map. Until a frame is
-    found in it, frames are lost and change nothing.
+    The first camera and free cameras have moved since the state was saved, so their next frames may be anywhere in the
+    map. Until a frame is found in it, frames are lost and change nothing. A pending loop closure is applied first, and
+    the version of the map is then larger than ``map_version``.
 
     Args:
         slam: as loaded; it is changed.
@@ -18,4 +20,7 @@ def rolled_back(slam: Slam, map_version: int) -> Slam:
     slam._mapper.version = map_version
     slam.close_loops()
     slam._tracker.forget()
+    for camera in slam.further_cameras.values():
+        if isinstance(camera, FreeCamera):
+            camera.forget()
     return slam

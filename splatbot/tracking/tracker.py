@@ -108,9 +108,11 @@ class Tracker:
             self._costs.record("overhead", 1, ms)
 
     def forget(self) -> None:
-        """Discard the motion: the next frame may be anywhere in the map."""
+        """Discard the motion and the search: the next frame may be anywhere in the map."""
         self.motion = ConstantVelocity()
         self._filter.forget()
+        self._search.restart()
+        self._candidate = None
         self._lost = True
 
     def move(self, T_new_old: Array) -> None:

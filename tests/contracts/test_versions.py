@@ -18,10 +18,13 @@ from splatbot.client import Client, ServiceError
 from splatbot.config import Config
 from splatbot.errors import SplatbotError
 from splatbot.gaussians import Snapshot
-from splatbot.geometry import inverse
+from splatbot.geometry import inverse, se3_exp
 from splatbot.logs import open_log
 from splatbot.services.keys import hash_key, new_key
 from splatbot.services.settings import ServiceSettings
+from splatbot.services.versions import read_version
+from splatbot.slam import Slam
+from splatbot.trajectory import Trajectory
 from tests.contracts.conftest import Service, running, wall, wall_store
 
 QUICK = Config.model_validate({"mapping": {"refine_iterations": 2, "final_iterations": 3}})
@@ -81,6 +84,34 @@ def test_a_restart_serves_the_restored_state_with_its_versions(tmp_path: Path) -
             (3, True, True),
         ]
         assert service.client.post("/v1/maps/desk/versions/2/restore").json()["map_version"] == 8
+
+
+def test_a_cached_copy_of_a_deleted_map_is_not_current_for_the_next_map_of_its_name(api: Service) -> None:
+    first = api.client.get("/v1/maps/desk/splats.ply")
+    kept = {"If-None-Match": first.headers["etag"]}
+    assert api.client.get("/v1/maps/desk/splats.ply", headers=kept).status_code == 304
+    assert api.client.delete("/v1/maps/desk").status_code == 204
+    api.store.add("desk", source="a log", state="ended", snapshot=wall(5, z=2.0))
+    second = api.client.get("/v1/maps/desk/splats.ply", headers=kept)
+    assert (second.status_code, second.content != first.content) == (200, True)
+
+
+def test_a_restored_version_without_a_path_leaves_no_path_of_the_state_before(api: Service) -> None:
+    api.client.post("/v1/maps/desk/versions", json={})
+    path = Trajectory(np.arange(3.0), np.tile(np.eye(4), (3, 1, 1)))
+    api.store.publish("desk", wall(6), path)
+    assert len(api.client.get("/v1/maps/desk/trajectory").json()["stamps"]) == 3
+    api.client.post("/v1/maps/desk/versions/1/restore")
+    assert api.client.get("/v1/maps/desk/trajectory").json()["stamps"] == []
+
+
+def test_a_repeated_diff_with_its_key_is_the_same_job_after_its_maps_are_gone(api: Service) -> None:
+    api.store.add("shelf", source="a log", state="ended", snapshot=wall(1))
+    headers = {"Idempotency-Key": "once"}
+    first = api.client.post("/v1/maps/desk/diff", json={"other": "shelf"}, headers=headers)
+    api.client.delete("/v1/maps/shelf")
+    again = api.client.post("/v1/maps/desk/diff", json={"other": "shelf"}, headers=headers)
+    assert (again.status_code, again.json()["id"]) == (202, first.json()["id"])
 
 
 def test_two_restorations_at_once_are_two_states_one_after_the_other(api: Service) -> None:
@@ -302,6 +333,46 @@ def test_a_key_beyond_its_bytes_makes_no_map_version_or_frame(shared: Service) -
         with Client(shared.url, key=KEYS["one"]) as robot, pytest.raises(ServiceError, match="bytes") as caught:
             robot.push("a", frame)
         assert (caught.value.status, served.owner == one.get("/v1/quota").json()["client"]) == (403, True)
+
+
+def test_a_restoration_of_another_client_s_version_counts_in_the_caller_s_bytes(shared: Service) -> None:
+    shared.store.add("desk", source="a log", state="ended", snapshot=wall(5))
+    with _of(shared, "one") as one, _of(shared, "two") as two:
+        size = one.post("/v1/maps/desk/versions", json={}).json()["bytes"]
+        shared.store.publish("desk", wall(6))
+        one.post("/v1/maps/desk/versions", json={})
+        shared.runtime.settings.max_client_bytes = size - 1
+        refused = two.post("/v1/maps/desk/versions/1/restore")
+        assert (refused.status_code, "bytes" in refused.json()["detail"]) == (403, True)
+        assert two.get("/v1/maps/desk").json()["map_version"] == 6
+        assert one.post("/v1/maps/desk/versions/1/restore").status_code == 200  # it has the files already
+
+
+def test_a_restored_version_with_a_pending_loop_closure_is_recorded_as_the_corrected_map(tmp_path: Path) -> None:
+    log = open_log("synthetic:tabletop?frames=24&width=160&height=120&arc=24")
+    move = se3_exp(np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    with running(ServiceSettings(data_dir=tmp_path), config=QUICK) as service, Client(service.url) as robot:
+        robot.create_map("live")
+        for index in range(4):
+            robot.push("live", log.read(index))
+        served = service.store.get("live")
+        with service.runtime.history._paused(served) as mapping:
+            assert mapping is not None
+            assert isinstance(mapping.mapper, Slam)
+            loops = mapping.mapper._mapper.loops
+            loops.correction = dict.fromkeys(loops.graph.poses, move)
+        saved = robot.save_version("live")
+        made = robot.restore("live", saved["number"])
+        now = service.store.get("live")
+        assert (made["restored_from"], made["map_version"]) == (saved["number"], now.map_version)
+        versions = service.runtime.history.versions
+        version = versions.get("live", made["number"])
+        with versions.pinned(version) as folder:
+            kept = read_version(version, folder)["snapshot"].model
+        with versions.pinned(versions.get("live", saved["number"])) as folder:
+            before = read_version(version, folder)["snapshot"].model
+        np.testing.assert_array_equal(kept.means, now.ready.model.means)
+        assert len(kept.means) != len(before.means) or not np.allclose(kept.means, before.means, atol=0.05)
 
 
 def test_a_stream_goes_on_from_the_restored_version_and_finds_its_camera_again(tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from splatbot.geometry import inverse, se3_exp
 from splatbot.logs.synthetic import SyntheticLog
 from splatbot.mapping.further_camera import MountedCamera
 from splatbot.mapping.keyframes import NUMBERS
+from splatbot.run.rollback import rolled_back
 from splatbot.slam import Slam
 from splatbot.tracking.nearby_keyframes import pose_distance
 from tests.several_cameras import WRONG, estimated, frames_of, in_order, in_world, pose_config, side_view, wrist_log
@@ -218,6 +219,17 @@ def test_a_pose_of_a_free_camera_moves_with_the_keyframe_that_views_the_same_pla
     slam._mapper.loops.correction = {number: move if number else np.eye(4) for number in numbers}
     slam.close_loops()
     assert np.allclose(slam.trajectory_of("head").T_world_camera, before, atol=1e-9)
+
+
+def test_a_free_camera_is_confirmed_again_after_the_map_went_back() -> None:
+    poses = [wrist().ground_truth.T_world_camera[0]] * FRAMES  # it stays at the first keyframe
+    slam = processed(CameraConfig(), frames_of(wrist(), poses, wrist().stamps, "head", width=240), "head")
+    assert [r.verdict for r in slam.results if r.camera_name][-1] == "ok"
+    rolled_back(slam, 1 + slam.snapshot().map_version)
+    assert slam.further_cameras["head"].anchor is None
+    stamps = [wrist().stamps[-1] + k / 30 for k in range(1, 5)]
+    again = [slam.process(frame) for frame in frames_of(wrist(), poses[:4], stamps, "head", width=240)]
+    assert [r.verdict for r in again] == ["lost"] * 3 + ["ok"]
 
 
 @pytest.mark.long

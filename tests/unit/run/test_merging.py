@@ -14,10 +14,11 @@ from splatbot.errors import FormatError, InputError
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import inverse
 from splatbot.logs import open_log
+from splatbot.mapping.alignment import MapAlignment
 from splatbot.results.folder import RunFolder
 from splatbot.run import map_log
 from splatbot.run.comparing import compare_runs
-from splatbot.run.merging import align_runs, merge_runs
+from splatbot.run.merging import align_runs, merge_runs, merged_slam
 from splatbot.run.state import SavedRun
 from splatbot.slam import Slam
 from tests.changed_scenes import SceneLog, matches, reported_places, scene_pair
@@ -131,6 +132,16 @@ def test_wrong_runs_are_refused_and_nothing_is_written(
     with pytest.raises(InputError, match="holds a run already"):
         merge_runs(align_runs(*runs), out=room)
     assert main(["diff", str(tmp_path), str(runs[0])]) == 2
+
+
+def test_a_joined_map_has_the_stamp_of_the_last_keyframe_of_the_later_map(tmp_path: Path) -> None:
+    log = "synthetic:tabletop?frames=3&width=160&height=120"
+    a, b = (SavedRun.load(_map(log, tmp_path / name)) for name in ("a", "b"))
+    alignment = MapAlignment(np.eye(4), np.zeros((6, 6)), {}, 1, 1)
+    slam, _ = merged_slam(a, b, alignment, first_index=3, time_offset=100.0)
+    last = max(result.stamp for result in slam.results if result.keyframe)
+    assert last >= 100.0
+    assert slam.snapshot().stamp == pytest.approx(last)
 
 
 def test_a_merged_state_has_the_keyframes_of_both(runs: tuple[Path, Path], merged: Path) -> None:

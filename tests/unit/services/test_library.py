@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import resource
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -88,6 +90,27 @@ def test_a_damaged_map_does_not_keep_the_others_from_being_served(tmp_path: Path
     (tmp_path / "evil").mkdir()
     (tmp_path / "evil" / "current").write_text("../desk/v3")
     assert _loaded(tmp_path).map_version == 3
+
+
+def test_a_map_saved_without_a_world_has_the_same_world_at_each_start_and_another_name_another_one(
+    tmp_path: Path,
+) -> None:
+    """Format 1 has neither a world nor checksums."""
+    MapLibrary(tmp_path).save(_served(3))
+    state = tmp_path / "desk" / "v3"
+    (state / "SHA256SUMS").unlink()
+    (state / "map.json").write_text(json.dumps({"source": "desk log", "map_version": 3, "stamp": 1.5}))
+    shutil.copytree(tmp_path / "desk", tmp_path / ".other" / "shelf")
+    first, again = _loaded(tmp_path), MapStore()
+    library = MapLibrary(tmp_path)
+    library.load_all(again)
+    assert again.get("desk").world == first.world
+    again.publish("desk", Snapshot(uniform_model(np.zeros((5, 3))), 4))
+    library.save(again.get("desk"))
+    assert _loaded(tmp_path).world == first.world
+    elsewhere = MapStore()
+    MapLibrary(tmp_path / ".other").load_all(elsewhere)
+    assert elsewhere.get("shelf").world != first.world
 
 
 def test_a_removed_map_is_gone_after_a_restart(tmp_path: Path) -> None:

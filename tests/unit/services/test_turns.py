@@ -66,3 +66,33 @@ def test_an_error_in_a_turn_gives_it_back() -> None:
         _ = 1 // 0
     with turns.frame():
         pass
+
+
+def test_a_frame_is_mapped_between_two_turns_of_threads_that_save_in_a_loop() -> None:
+    turns, order, stop = Turns(), list[str](), threading.Event()
+
+    def save() -> None:
+        while not stop.is_set():
+            with turns.between_frames(10.0):
+                order.append("between")
+
+    def one_frame() -> None:
+        with turns.frame():
+            order.append("frame")
+
+    savers = [threading.Thread(target=save) for _ in range(3)]
+    with turns.frame():
+        for saver in savers:
+            saver.start()
+        until(lambda: turns._between == 3)
+    for _ in range(20):
+        with turns.between_frames(10.0):
+            frame = threading.Thread(target=one_frame)
+            frame.start()
+            until(lambda: turns._frames == 1)
+            before = len(order)
+        frame.join()
+        assert order[before] == "frame"
+    stop.set()
+    for saver in savers:
+        saver.join()

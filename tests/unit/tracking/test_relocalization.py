@@ -49,6 +49,17 @@ def test_two_frames_that_contradict_each_other_are_not_accepted() -> None:
     assert run.error(again, 10)[0] < 2e-3
 
 
+def test_a_frame_after_forgetting_is_not_confirmed_by_one_before_and_is_searched_from_the_latest_keyframe() -> None:
+    run = lost_run()
+    run.track(replace(run.frames[1], stamp=2.0))
+    assert run.tracker.awaits_confirmation
+    run.tracker.forget()
+    assert not run.tracker.awaits_confirmation
+    assert run.tracker._search.next_index(3) == 2
+    run.tracker._search.restart()
+    assert run.track(replace(run.frames[2], stamp=2.0 + 1 / 30)).verdict == "lost"
+
+
 @pytest.mark.parametrize(("moved", "dt", "agrees"), [(0.05, 1 / 30, True), (0.3, 1 / 30, False), (0.3, 0.5, True)])
 def test_a_camera_moves_at_the_speed_of_an_arm_or_a_hand(moved: float, dt: float, agrees: bool) -> None:
     candidate = RelocalizationCandidate(1.0, np.eye(4))
