@@ -156,7 +156,7 @@ class Slam:
         ``results`` starts again; the world frame remains that of the map.
 
         Args:
-            config: configuration whose further cameras replace those of the map. If None, these remain.
+            config: configuration whose sensor and further cameras replace those of the map. If None, these remain.
 
         Raises:
             InputError: There is no map yet.
@@ -168,6 +168,7 @@ class Slam:
             self._mapper.freeze()
         self._localization_only = True
         self.config = config or self.config
+        self._tracker.config = self.config.tracking
         self._image_sizes = {}
         self._further_cameras = self._make_further_cameras()
         self.results = []

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -13,7 +13,7 @@ from splatbot.calibration.estimate import Estimate
 from splatbot.calibration.registration import image_velocity
 from splatbot.calibration.sensor import CONSTANTS as SENSOR
 from splatbot.calibration.sensor import calibrate_frames, view_of
-from splatbot.config import Config, with_sensor
+from splatbot.config import Config, SensorConfig, with_sensor
 from splatbot.errors import InputError
 from splatbot.frame import Frame
 from splatbot.geometry import se3_log
@@ -29,8 +29,8 @@ Array = NDArray[np.float64]
 class SensorTimingConstants:
     """Constants of the estimate."""
 
-    bytes: int = 300_000_000
-    """Memory of the decoded frames [bytes], which bounds their number."""
+    bytes: int = 520_000_000
+    """Memory of the decoded frames and of a copy of their depth [bytes], which bounds their number."""
     probes: int = 10
     """Neighbouring frames [1] whose motion decides whether the log is fast enough."""
     min_speed: float = 100.0
@@ -40,6 +40,8 @@ class SensorTimingConstants:
 
 
 CONSTANTS = SensorTimingConstants()
+
+_TIMES = {"readout", "depth_delay"}
 
 
 @dataclass(frozen=True)
@@ -64,6 +66,16 @@ class SensorTiming:
         """Return the values by name, with their units."""
         return {name if name == "frames" else f"{name}_s": value for name, value in asdict(self).items()}
 
+    @classmethod
+    def of_metrics(cls, values: Mapping[str, Any] | None) -> SensorTiming | None:
+        """Return the times in ``metrics.json``; None without them."""
+        if values is None:
+            return None
+        numbers: dict[str, Any] = {
+            name.removesuffix("_s"): np.inf if value is None else value for name, value in values.items()
+        }
+        return cls(**numbers)
+
 
 def with_estimated_timing(
     config: Config, log: Log, total: int, *, report_progress: Callable[[str], None] = lambda _: None
@@ -80,7 +92,7 @@ def with_estimated_timing(
         report_progress: receives the current step.
     """
     simulated = bool(log.effects) or log.uri.startswith(PREFIX)
-    if {"readout", "depth_delay"} & config.sensor.model_fields_set or simulated or log.cameras:
+    if _TIMES & config.sensor.model_fields_set or simulated or log.cameras:
         return config, None
     timing = estimate_timing(log, total, report_progress)
     if timing is None:
@@ -89,29 +101,40 @@ def with_estimated_timing(
     return with_sensor(config, values), timing
 
 
+def without_timing(config: Config) -> Config:
+    """Return the configuration as if it stated no time of the sensor."""
+    stated = config.sensor.model_dump(include=config.sensor.model_fields_set - _TIMES)
+    return with_sensor(config.model_copy(update={"sensor": SensorConfig(**stated)}), {})
+
+
 def estimate_timing(log: Log, total: int, report_progress: Callable[[str], None]) -> SensorTiming | None:
-    """Estimate readout time and delay of depth from the first frames, or return None if they do not determine them.
+    """Estimate readout time and delay of depth from the first frames, or return None if they determine neither.
 
     A readout time longer than the time between frames is impossible: such stamps are not those of the images, and
-    nothing is estimated.
+    nothing is estimated. The same holds for a negative one.
     """
-    _p, count = CONSTANTS, min(total, SENSOR.max_frames)
+    count = min(total, len(log), SENSOR.max_frames)
     if count < SENSOR.min_frames or not _turns(log, count):
         return None
     frames = _read(log, range(count), report_progress)
     if len(frames) < SENSOR.min_frames:
         return None
     found = calibrate_frames(frames, report_progress=report_progress)
-    readout, delay = found.readout, found.depth_delay
     interval = float(np.median(np.diff([frame.stamp for frame in frames])))
-    if not _is_significant(readout) or not 0 < readout.value <= interval + 2 * readout.sigma:
+    readout, delay = _significant(found.readout), _significant(found.depth_delay)
+    if not 0 <= readout <= interval + 2 * found.readout.sigma:
         return None
-    late = delay if _is_significant(delay) and abs(delay.value) <= interval else Estimate(0.0, delay.sigma, "s")
-    return SensorTiming(min(readout.value, interval), readout.sigma, late.value, late.sigma, len(frames))
+    if abs(delay) > interval:
+        delay = 0.0
+    if readout == delay == 0:
+        return None
+    return SensorTiming(min(readout, interval), found.readout.sigma, delay, found.depth_delay.sigma, len(frames))
 
 
-def _is_significant(estimate: Estimate) -> bool:
-    return not estimate.refusal and abs(estimate.value) > CONSTANTS.significance * estimate.sigma
+def _significant(estimate: Estimate) -> float:
+    """Return the value, or 0 if it is refused or within the error of 0."""
+    certain = not estimate.refusal and abs(estimate.value) > CONSTANTS.significance * estimate.sigma
+    return estimate.value if certain else 0.0
 
 
 def _turns(log: Log, count: int) -> bool:
@@ -126,6 +149,8 @@ def _turns(log: Log, count: int) -> bool:
 
 def _speed(first: Frame, second: Frame) -> float:
     """Return the mean speed of the image between two frames [px/s]; 0 if it is not known."""
+    if first.camera != second.camera:
+        return 0.0
     a, b = view_of(first), view_of(second)
     pose, seconds = match_pose(b.features, [(a.features, np.eye(4))], first.camera), b.stamp - a.stamp
     if pose is None or seconds <= 0:
@@ -134,15 +159,18 @@ def _speed(first: Frame, second: Frame) -> float:
 
 
 def _read(log: Log, indices: Sequence[int], report_progress: Callable[[str], None]) -> list[Frame]:
-    """Return the readable frames at consecutive indices, as many as the memory bound permits."""
+    """Return the readable frames of one camera at consecutive indices, as many as the memory bound permits."""
     frames: list[Frame] = []
     for index in indices:
         try:
             frame = log[index]
         except InputError:
             continue  # the mapping names it
+        if frames and frame.camera != frames[0].camera:
+            break
         frames.append(frame)
         report_progress(f"frame {len(frames)}")
-        if (len(frames) + 1) * (frame.rgb.nbytes + frame.depth.nbytes) > CONSTANTS.bytes:
+        most = CONSTANTS.bytes // (frame.rgb.nbytes + 2 * frame.depth.nbytes)
+        if len(frames) >= most or most < SENSOR.min_frames:
             break
     return frames

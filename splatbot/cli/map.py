@@ -261,11 +261,10 @@ def _pace(metrics: dict[str, Any]) -> list[tuple[str, str]]:
 def _sensor(timing: dict[str, Any] | None) -> list[tuple[str, str]]:
     if timing is None:
         return []
-    text = f"rolling shutter {1e3 * timing['readout_s']:.0f} ms"
-    delay = 1e3 * timing["depth_delay_s"]
-    if delay:
-        text += f", depth {abs(delay):.0f} ms {'late' if delay > 0 else 'early'}"
-    return [("sensor, estimated", text)]
+    readout, delay = 1e3 * timing["readout_s"], 1e3 * timing["depth_delay_s"]
+    shutter = [f"rolling shutter {readout:.0f} ms"] if readout else []
+    late = [f"depth {abs(delay):.0f} ms {'late' if delay > 0 else 'early'}"] if delay else []
+    return [("sensor, estimated", ", ".join(shutter + late))]
 
 
 def _mishaps(metrics: dict[str, Any]) -> list[tuple[str, str]]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from splatbot.calibration.timing import SensorTiming, with_estimated_timing
+from splatbot.calibration.timing import SensorTiming, with_estimated_timing, without_timing
 from splatbot.config import Config, with_cameras, with_sensor
 from splatbot.errors import InputError, LogError
 from splatbot.logs import Log
@@ -97,16 +97,28 @@ def map_log(
     if resume is not None:
         resume.place.check(log)
         config, slam = resume.config, resume.slam
+    report_step = on_progress or (lambda _: None)
+    timing = _estimated_timing(resume)
+
+    def calibrated(config: Config) -> tuple[Config, SensorTiming | None]:
+        config = with_sensor(config, log.calibration.sensor, file=log.calibration.file)
+        if isinstance(log, RecordedCamera):
+            return config, None
+        total = len(log) if max_frames is None else max_frames
+        step = Progress("calibrating", 0, total, 0.0)
+        return with_estimated_timing(config, log, total, report_progress=lambda _: report_step(step))
+
     if localise is not None:
         slam = localise.slam
         config = with_cameras(localise.config.model_copy(update={"cameras": {}}), log.cameras, file=log.uri)
+        if _estimated_timing(localise) is not None:  # of the recording that was mapped
+            config, timing = calibrated(without_timing(config))
         slam.localise_only(config)
     config = config or (slam.config if slam else Config())
     if slam is None:
         if log.cameras and config.cameras:
             hint = "leave `cameras` out of the configuration, or give the recording of one camera"
             raise InputError("describes its cameras itself.", file=log.uri, field="cameras", hint=hint)
-        config = with_sensor(config, log.calibration.sensor, file=log.calibration.file)
         config = with_cameras(config, log.cameras, file=log.uri)
     if not log.cameras.keys() <= config.cameras.keys():
         hint = "restore the file of the cameras, or map the log again"
@@ -119,14 +131,8 @@ def map_log(
         wall_clock = config.tracking.model_copy(update={"deterministic": False})
         config = config.model_copy(update={"mapping": threaded, "tracking": wall_clock})
     frames = _frames(log, max_frames, realtime, rate)
-    timing: SensorTiming | None = None
-    report_step = on_progress or (lambda _: None)
-    if slam is None and not isinstance(log, RecordedCamera):
-
-        def calibrating(step: str) -> None:
-            report_step(Progress("calibrating", 0, frames.total, 0.0))
-
-        config, timing = with_estimated_timing(config, log, frames.total, report_progress=calibrating)
+    if slam is None:
+        config, timing = calibrated(config)
     folder = RunFolder.create(out)
     truth = log.ground_truth  # read now: a damaged file must not cost the user a whole run
     loop = FrameLoop(frames, slam or Slam(config), config, on_bad_frame, report_step)
@@ -171,6 +177,14 @@ def map_log(
     if loop.crash is not None:
         raise loop.crash
     return RunResult(folder.path, ended.metrics(), error=loop.error, signal=interrupts.requested)
+
+
+def _estimated_timing(run: SavedRun | None) -> SensorTiming | None:
+    """Return the times of the sensor that an earlier run estimated."""
+    folder = None if run is None else RunFolder(run.folder)
+    if folder is None or not folder.metrics.is_file():
+        return None
+    return SensorTiming.of_metrics(folder.load_metrics().get("sensor_timing"))
 
 
 def _frames(log: Log, max_frames: int | None, realtime: bool, rate: float | None) -> LogFrames:

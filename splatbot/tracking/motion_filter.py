@@ -86,33 +86,36 @@ class CameraMotion:
         """Return the state after the alignment of a frame, which measures the pose and, by its rows, the velocity.
 
         The residuals of a rectified image depend on the pose and on the error of its twist. Row s, s seconds after the
-        stamp, sees a point moved by -(ξ + s η). With the normal equations (H_b, g_b) of bands of rows at times s_b::
+        stamp, sees a point moved by -(ξ + s η). Bands of rows at times s_b have the normal equations (H_b, g_b), with
+        the moments H_n = Σ s_bⁿ H_b and G = H_0⁻¹ H_1::
 
-            information = [Σ H_b      Σ s_b H_b ] / k     gradient = [0            ] / k
-                          [Σ s_b H_b  Σ s_b² H_b]                    [Σ s_b g_b]
+            information = [Σ⁻¹     Σ⁻¹ G                            ]
+                          [Gᵀ Σ⁻¹  Gᵀ Σ⁻¹ G + (H_2 - H_1 G) / k]
+            gradient    = [0, (Σ s_b g_b - H_1 H_0⁻¹ Σ g_b) / k]
 
-        The factor k scales their pose to its covariance Σ, which is larger because residuals are correlated:
-        k⁶ = det(Σ) det(Σ_b H_b). Without rows the information is that of the pose, Σ⁻¹.
+        The pose of the whole image is that at the mean time of its rows, and has the covariance Σ. The rest of the rows
+        measures the velocity. The factor k by which residuals are correlated follows from Σ: k⁶ = det(Σ) det(H_0).
+        Rows of depth with a delay count as those of colour. Without rows the information is Σ⁻¹ alone.
 
         Args:
             alignment: alignment of the rectified image.
-            covariance: (6, 6) of its pose.
+            covariance: (6, 6) of its pose Σ, large in directions that the frame does not constrain.
             used: (6,) twist [m/s, rad/s] with which the image was rectified.
             readout: time from the first row to the last [s].
         """
-        information, gradient = np.zeros((12, 12)), np.zeros(12)
-        n, H = len(alignment.band_gradient), alignment.band_information
-        total = H.sum(0) + _BAND_DAMPING * np.eye(6)
+        gradient, g, H = np.zeros(12), alignment.band_gradient, alignment.band_information
+        n, H0 = len(g), H.sum(0) + _BAND_DAMPING * np.eye(6)
         covariance = covariance + _DAMPING * np.eye(6)
-        if readout > 0 and n > 0 and np.isfinite(total).all() and np.isfinite(alignment.band_gradient).all():
+        pose_information, G, rows = np.linalg.inv(covariance), np.zeros((6, 6)), np.zeros((6, 6))
+        if readout > 0 and n > 0 and np.isfinite(H0).all() and np.isfinite(g).all():
             s = ((np.arange(n) + 0.5) / n - 0.5) * readout
             H1, H2 = np.einsum("b,bij->ij", s, H), np.einsum("b,bij->ij", s**2, H)
-            log_k = np.linalg.slogdet(covariance)[1] + np.linalg.slogdet(total)[1]
+            log_k = np.linalg.slogdet(covariance)[1] + np.linalg.slogdet(H0)[1]
             k = np.exp(max(float(log_k), 0.0) / 6)
-            information = np.block([[total, H1], [H1, H2]]) / k
-            gradient[6:] = s @ alignment.band_gradient / k
-        else:
-            information[:6, :6] = np.linalg.inv(covariance)
+            G = np.linalg.solve(H0, H1)
+            rows, gradient[6:] = (H2 - H1 @ G) / k, (s @ g - G.T @ g.sum(0)) / k
+        coupled = pose_information @ G
+        information = np.block([[pose_information, coupled], [coupled.T, G.T @ coupled + rows]])
         moved = se3_log(inverse(self.T_world_camera) @ alignment.T_world_camera)
         at = np.concatenate([moved, used - self.twist])
         P = np.linalg.inv(np.linalg.inv(self.covariance) + information)
@@ -137,9 +140,9 @@ class MotionFilter:
         return self._state.predict(stamp)
 
     def twist_at(self, stamp: float) -> Array:
-        """Return the expected twist (6,) [m/s, rad/s] at a time [s], zero where the motion is unknown."""
-        state = self.predict(stamp)
-        return np.zeros(6) if state is None else state.twist
+        """Return the expected twist (6,) [m/s, rad/s] at a time [s] near the last pose, zero where it is unknown."""
+        known = self._state is not None and abs(stamp - self._state.stamp) <= CONSTANTS.max_gap
+        return self._state.twist if known and self._state is not None else np.zeros(6)
 
     def update(self, state: CameraMotion) -> None:
         """Replace the state."""

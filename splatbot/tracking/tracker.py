@@ -25,7 +25,7 @@ from splatbot.tracking.relocalization import PlaceSearch, RelocalizationCandidat
 from splatbot.tracking.scheduler import StageScheduler
 from splatbot.tracking.stage import TrackingProblem
 from splatbot.tracking.stages import StageSet
-from splatbot.tracking.uncertainty import Uncertainty, world_uncertainty
+from splatbot.tracking.uncertainty import Uncertainty, alignment_covariance, world_uncertainty
 
 __all__ = ["PoseEstimate", "TrackedKeyframe", "Tracker", "order_by_distance", "pose_distance"]
 
@@ -88,7 +88,7 @@ class Tracker:
         best = self._rectify_again(best, problem, scheduler)
         pose, uncertainty = self._fuse_prior(best, trusted_prior, motion_prior)
         pose = self._confirm_relocalization(prepared.frame.stamp, pose)
-        pose, uncertainty = self._filter_motion(pose, uncertainty, problem.prepared, trusted_prior)
+        pose, uncertainty = self._filter_motion(pose, uncertainty, best, problem.prepared, trusted_prior)
         self._update(prepared.frame.stamp, pose, robot_prior)
         return PoseEstimate.create(pose, uncertainty, problem, scheduler.budget)
 
@@ -219,10 +219,15 @@ class Tracker:
         self,
         pose: ScoredHypothesis,
         uncertainty: Uncertainty,
+        best: ScoredHypothesis,
         prepared: PreparedFrame,
         robot_prior: Prediction | None,
     ) -> tuple[ScoredHypothesis, Uncertainty]:
-        """Weigh the pose against the motion so far; a robot prior knows the motion better and keeps the pose."""
+        """Weigh the pose against the motion so far; a robot prior knows the motion better and keeps the pose.
+
+        In directions that the frame does not constrain, the filter takes its own prediction. ``best`` is the pose
+        before these were filled; a filled pose would count the prediction twice.
+        """
         if pose.verdict == "lost":
             return pose, uncertainty
         stamp, T = prepared.frame.stamp, pose.T_world_camera
@@ -230,18 +235,20 @@ class Tracker:
         if predicted is None:
             self._filter.update(CameraMotion.at_pose(stamp, T, self.variance_scale * pose.covariance))
             return pose, uncertainty
-        state = self._measured(predicted, pose, prepared)
-        if robot_prior is not None:
-            self._filter.update(replace(state, T_world_camera=T))
-            return pose, uncertainty
+        state = self._measured(predicted, pose if robot_prior is not None else best, prepared)
         self._filter.update(state)
+        if robot_prior is not None:
+            return pose, uncertainty
         pose = pose.with_pose(state.T_world_camera, state.covariance[:6, :6] / self.variance_scale)
         return pose, self._uncertainty(pose)
 
     def _measured(self, predicted: CameraMotion, pose: ScoredHypothesis, prepared: PreparedFrame) -> CameraMotion:
-        """Return the state of the motion after the measurement of a pose and its rows."""
-        covariance = self.variance_scale * pose.covariance
-        return predicted.measure(pose.hypothesis.alignment, covariance, prepared.twist, self.config.sensor.readout)
+        """Return the state of the motion after the measurement of a pose, and of its rows if no direction is weak."""
+        alignment, readout = pose.hypothesis.alignment, self.config.sensor.readout
+        if pose.weak is None:
+            return predicted.measure(alignment, self.variance_scale * pose.covariance, prepared.twist, readout)
+        known = alignment_covariance(pose.weak.known_part(alignment))
+        return predicted.measure(alignment, self.variance_scale * known, prepared.twist, 0.0)
 
     def _uncertainty(self, pose: ScoredHypothesis) -> Uncertainty:
         """Compute the uncertainty of a pose in the world from its own and that of its keyframes."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -12,13 +11,12 @@ import pytest
 from splatbot.calibration import timing
 from splatbot.calibration.estimate import Estimate
 from splatbot.calibration.sensor import SensorCalibration
-from splatbot.calibration.timing import SensorTiming, estimate_timing, with_estimated_timing
+from splatbot.calibration.timing import SensorTiming, estimate_timing, with_estimated_timing, without_timing
 from splatbot.config import Config, load_config
 from splatbot.errors import LogError
 from splatbot.frame import Frame
 from splatbot.logs import open_log
 from splatbot.logs.base import DerivedLog
-from splatbot.logs.record import record
 
 TURNING = "synthetic:room?trajectory=turns&frames=45&width=320&height=240"
 SLOW = "synthetic:tabletop?trajectory=arm&frames=30&width=160&height=120"
@@ -67,13 +65,30 @@ def test_a_stated_time_is_taken_without_a_look_at_the_frames(stated: dict[str, f
     assert log.reads == 0
 
 
-def test_a_simulated_camera_is_left_as_it_is(tmp_path: Path) -> None:
-    simulated = open_log(f"{TURNING}&effects=rolling_shutter:readout=0.02")
-    record(
-        open_log("synthetic:room?trajectory=turns&frames=2&width=64&height=48&effects=color_noise"), tmp_path / "log"
-    )
-    for log in (simulated, open_log(tmp_path / "log")):
+def test_a_simulated_camera_is_left_as_it_is() -> None:
+    simulated = Recording(f"{TURNING}&effects=rolling_shutter:readout=0.02")
+    simulated.effects = [{"name": "rolling_shutter"}]  # type: ignore[misc]
+    for log in (simulated, open_log(TURNING)):
         assert with_estimated_timing(Config(), log, len(log)) == (Config(), None)
+    assert simulated.reads == 0
+
+
+def test_frames_of_another_camera_end_the_estimate(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Mixed(Recording):
+        def _decode(self, index: int) -> Frame:
+            return super()._decode(index) if index < 25 else open_log(SLOW)[0]
+
+    monkeypatch.setattr(timing, "_turns", lambda *_: True)
+    log, numbers = Mixed(TURNING), list[int]()
+
+    def found(frames: list[Frame], **_: object) -> SensorCalibration:
+        numbers.append(len(frames))
+        none = Estimate(0.0, np.inf, "s", "not known")
+        return SensorCalibration(none, none, none, none, none, frames[0].camera)
+
+    monkeypatch.setattr(timing, "calibrate_frames", found)
+    assert estimate_timing(log, 1000, lambda _: None) is None  # more frames than the log has
+    assert numbers == [25]
 
 
 def estimated(monkeypatch: pytest.MonkeyPatch, readout: Estimate, delay: Estimate) -> SensorTiming | None:
@@ -102,8 +117,12 @@ def test_a_readout_longer_than_the_time_between_frames_shows_wrong_stamps(monkey
 
 def test_times_within_their_error_of_zero_or_refused_are_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
     refused = replace(known(0.01), refusal="too slow")
-    for readout in (known(0.002), known(-0.02), refused):
-        assert estimated(monkeypatch, readout, known(-0.01)) is None
+    assert estimated(monkeypatch, known(-0.02), known(-0.01)) is None
+    for readout in (known(0.002), refused):
+        assert estimated(monkeypatch, readout, refused) is None
+        found = estimated(monkeypatch, readout, known(-0.01))
+        assert found is not None
+        assert (found.readout, found.depth_delay) == (0.0, -0.01)
     for delay in (known(0.002), refused, known(0.04)):
         found = estimated(monkeypatch, known(0.02), delay)
         assert found is not None
@@ -114,7 +133,17 @@ def test_times_within_their_error_of_zero_or_refused_are_not_used(monkeypatch: p
 
 
 def test_the_memory_of_the_frames_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(timing, "CONSTANTS", replace(timing.CONSTANTS, bytes=30 * 32 * 24 * 7))
+    monkeypatch.setattr(timing, "CONSTANTS", replace(timing.CONSTANTS, bytes=30 * 32 * 24 * 11))
     found = estimated(monkeypatch, known(0.02), known(-0.018))
     assert found is not None
     assert found.frames == 30
+
+
+def test_the_times_in_metrics_are_read_again_and_a_configuration_forgets_them() -> None:
+    times = SensorTiming(0.02, 0.001, -0.01, float("inf"), 50)
+    assert SensorTiming.of_metrics(times.metrics() | {"depth_delay_sigma_s": None}) == times
+    assert SensorTiming.of_metrics(None) is None
+    stated = load_config(overrides={"sensor.readout": 0.02, "sensor.max_depth": 3.0})
+    forgot = without_timing(stated)
+    assert (forgot.sensor.readout, forgot.tracking.sensor.readout, forgot.sensor.max_depth) == (0.0, 0.0, 3.0)
+    assert "readout" not in forgot.sensor.model_fields_set

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,10 +11,16 @@ import pytest
 from splatbot.config import TrackingConfig
 from splatbot.frame import Frame
 from splatbot.geometry import se3_exp
+from splatbot.tracking.align import Alignment
+from splatbot.tracking.degeneracy import weak_directions
 from splatbot.tracking.features import Features
+from splatbot.tracking.health import Health
+from splatbot.tracking.hypothesis import Hypothesis, ScoredHypothesis
+from splatbot.tracking.motion_filter import CameraMotion
 from splatbot.tracking.prepare import PreparedFrame, prepare
 from splatbot.tracking.reference import Reference, make_reference
 from splatbot.tracking.tracker import PoseEstimate, Tracker, order_by_distance, pose_distance
+from splatbot.tracking.uncertainty import alignment_covariance
 from tests.rgbd import Array, small_config, tabletop, wall_frame
 
 
@@ -175,3 +182,32 @@ def test_keyframes_are_ordered_by_distance_a_radian_counting_half_a_metre() -> N
 
     views = [at(0.3, 0, 0, 0, 0, 0), at(0, 0, 0, 0, 0.5, 0), at(0.1, 0, 0, 0, 0, 0), at(0.1, 0, 0, 0, 0.5, 0)]
     assert order_by_distance(views, np.eye(4)) == [2, 1, 0, 3]
+
+
+def test_an_unconstrained_direction_is_as_uncertain_as_it_errs() -> None:
+    """A corridor along x for 2 s, where accelerations of 1 m/s² persist for 0.1 s: the stated σ is the RMS error."""
+    information = np.diag([0.0, 1e7, 1e7, 1e7, 1e7, 1e7])
+    weak = weak_directions(information, 1.0, TrackingConfig().min_eigen_ratio)
+    errors, sigmas = [], []
+    for seed in range(20):
+        rng, tracker, x, v, a = np.random.default_rng(seed), Tracker(TrackingConfig()), 0.0, 0.3, 0.0
+        tracker._filter.update(CameraMotion.at_pose(0.0, np.eye(4), np.zeros((6, 6)), np.array([v, 0, 0, 0, 0, 0])))
+        tracker.motion.update(-1 / 30, se3_exp([-v / 30, 0, 0, 0, 0, 0]))
+        tracker.motion.update(0.0, np.eye(4))
+        for k in range(60):
+            a = rng.normal() if k % 3 == 0 else a
+            x, v, stamp = x + v / 30 + a / 1800, v + a / 30, (k + 1) / 30
+            prior = tracker.motion.motion_prior(stamp, tracker._last_covariance)
+            alignment = Alignment(prior.T_world_camera, information, information, information, 48, 500.0)
+            health = Health(1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
+            best = ScoredHypothesis(
+                Hypothesis("direct", alignment, []), health, "degraded", (), weak, alignment_covariance(alignment)
+            )
+            prepared = SimpleNamespace(frame=SimpleNamespace(stamp=stamp), twist=np.zeros(6))
+            filled = tracker._fuse_prior(best, None, prior)
+            pose, _ = tracker._filter_motion(*filled, best, prepared, None)  # type: ignore[arg-type]
+            tracker._update(stamp, pose, None)
+        errors.append(pose.T_world_camera[0, 3] - x)
+        sigmas.append(pose.covariance[0, 0] ** 0.5)
+    ratio = np.sqrt(np.mean(np.square(errors))) / np.mean(sigmas)
+    assert 0.5 < ratio < 1.5
