@@ -47,7 +47,7 @@ def serving(*arguments: str, log: Path) -> Iterator[Serving]:
     Raises:
         SplatbotError: it did not start, or was not ready in time.
     """
-    command = [sys.executable, "-m", "splatbot", "serve", *arguments, "--port", "0"]
+    command = [sys.executable, "-P", "-m", "splatbot", "serve", *arguments, "--port", "0"]
     with log.open("w", encoding="utf-8") as errors:
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True)
         try:

@@ -100,7 +100,7 @@ def run_item(item: BatchItem, batch: Path, place: Path, threads: int, leash: int
     """
     folder = batch / item.name
     folder.mkdir(parents=True, exist_ok=True)
-    command = [sys.executable, "-m", "splatbot.batch.child", *item.words, "--out", str(folder)]
+    command = [sys.executable, "-P", "-m", "splatbot.batch.child", *item.words, "--out", str(folder)]
     environment = {**os.environ, **item.settings, **dict.fromkeys(_THREADS, str(threads)), "PYTHONUNBUFFERED": "1"}
     with (folder / OUTPUT).open("ab") as output:
         # The process inherits the lock: a second one waits until that of a supervisor which was killed has ended.

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
-import shutil
+import os
+import signal
 import sys
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from fnmatch import fnmatchcase
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Literal
@@ -12,9 +17,10 @@ import tyro
 
 from splatbot.cli.paths import check_new, check_output
 from splatbot.errors import InputError
-from splatbot.layouts import colmap_model
+from splatbot.layouts import COLMAP_DEPTH, colmap_model
 
 _WRITTEN = ("images", "sparse", "colmap.log")
+_REPLACED = (*_WRITTEN, "images_[0-9]*")  # the latter are smaller copies of earlier photographs
 
 
 def prepare(
@@ -65,11 +71,14 @@ def prepare(
     colmap = find_colmap()
     if matching == "auto":
         matching = "exhaustive" if source.is_dir() else "sequential"
-    out.parent.mkdir(parents=True, exist_ok=True)
+    home = out.resolve()
+    home.parent.mkdir(parents=True, exist_ok=True)
+    disk = home if home.exists() else home.parent  # so that the scene moves within one file system
     with (
         Interrupts() as interrupts,
+        _hangup_as_termination(),
         shares(quiet) as on_share,
-        TemporaryDirectory(prefix=f".{out.name}.", suffix=".draft", dir=out.parent) as draft,
+        TemporaryDirectory(prefix=f".{home.name}.", suffix=".draft", dir=disk) as draft,
     ):
         scene = Path(draft)
         with interrupts.interruptible():
@@ -77,7 +86,7 @@ def prepare(
             names = collect_photographs(source, scene / "images", frames, on_share)
             posed = pose_photographs(colmap, scene, names, matching, on_share)
             colmap_dataset(scene)  # opens as `splatbot train` opens it
-        _replace(scene, out)
+        _replace(scene, home)
     if not quiet:
         print(f"{out}: poses of {posed.photographs} of {len(names)} photographs; next: splatbot train {out}")
     if posed.models > 1:
@@ -94,14 +103,46 @@ def _check_replaceable(source: Path, out: Path, *, overwrite: bool) -> None:
     check_new(out, overwrite=overwrite)
     if out.resolve() in (source.resolve(), *source.resolve().parents):
         raise InputError("holds the input.", file=out, field="--out", hint="name another folder")
-    if out.exists() and any(out.iterdir()) and colmap_model(out) is None:
+    if not out.exists():
+        return
+    if any(out.iterdir()) and colmap_model(out) is None:
         raise InputError("is no COLMAP scene.", file=out, field="--out", hint="name another folder, or empty it")
+    depth = next((out / name for name in COLMAP_DEPTH if os.path.lexists(out / name)), None)
+    if depth is not None:
+        hint = "name another folder, or move it away: it belongs to the earlier photographs"
+        raise InputError("is in the scene to replace.", file=depth, field="--out", hint=hint)
+    mounted = next((place for place in _replaced(out) if place.lstat().st_dev != out.stat().st_dev), None)
+    if mounted is not None:
+        raise InputError("is on another disk.", file=mounted, field="--out", hint="unmount it, or name another folder")
+
+
+def _replaced(out: Path) -> list[Path]:
+    return [place for place in out.iterdir() if any(fnmatchcase(place.name, pattern) for pattern in _REPLACED)]
 
 
 def _replace(scene: Path, out: Path) -> None:
+    """Move a new scene from its draft, and the earlier one into the draft, with which it goes; an error restores it."""
+    earlier = scene / "earlier"
+    earlier.mkdir()
     out.mkdir(exist_ok=True)
-    for name in _WRITTEN:
-        place = out / name
-        if place.is_dir():
-            shutil.rmtree(place)
-        (scene / name).replace(place)
+    moves = [(place, earlier / place.name) for place in _replaced(out)]
+    moves += [(scene / name, out / name) for name in _WRITTEN]
+    with ExitStack() as undo:
+        for source, target in moves:
+            source.rename(target)
+            undo.callback(target.rename, source)
+        undo.pop_all()
+
+
+@contextmanager
+def _hangup_as_termination() -> Iterator[None]:
+    """Handle SIGHUP, the end of the terminal, as SIGTERM, unless it is ignored (nohup)."""
+    previous = signal.getsignal(signal.SIGHUP)
+    if previous is signal.SIG_IGN or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    signal.signal(signal.SIGHUP, signal.getsignal(signal.SIGTERM))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGHUP, previous)

@@ -20,7 +20,7 @@ import torch
 
 from splatbot.checksums import check_file
 from splatbot.errors import FormatError
-from splatbot.formats.checks import Table, check_finite, replace_degenerate
+from splatbot.formats.checks import Table, check_finite, damaged, replace_degenerate
 from splatbot.formats.conventions import from_channel_major, to_channel_major
 from splatbot.formats.ply_file import Rows, read_ply, write_ply
 from splatbot.gaussians.model import GaussianModel
@@ -41,6 +41,7 @@ def load_ply(path: str | Path) -> GaussianModel:
 
     Raises:
         FormatError: no such file, truncated, damaged, a property is missing, or a value is NaN or infinite.
+            Bookkeeping below 0, or anchors below -1, are damage too.
     """
     check_file(path)
     vertex = _read_vertices(path)
@@ -69,7 +70,7 @@ def load_ply(path: str | Path) -> GaussianModel:
         log_scales=_tensor(log_scales),
         opacity_logits=_tensor(opacity[:, 0]),
         sh=_tensor(sh),
-        **{name: _column(vertex, present, name, default) for name, default in _BOOKKEEPING.items()},
+        **{name: _column(path, vertex, name, default) for name, default in _BOOKKEEPING.items()},
     )
 
 
@@ -134,10 +135,13 @@ def _tensor(values: Table) -> torch.Tensor:
     return torch.from_numpy(values.astype(np.float32, order="C"))  # astype copies: the table can be freed
 
 
-def _column(vertex: Rows, present: Sequence[str], name: str, default: int) -> torch.Tensor:
+def _column(path: str | Path, vertex: Rows, name: str, default: int) -> torch.Tensor:
     kind = np.float32 if name == "uncertainty" else np.int32
-    if name not in present:
+    if name not in (vertex.dtype.names or ()):
         return torch.from_numpy(np.full(len(vertex), default, kind))
+    least = min(default, 0)
+    if not ((vertex[name] >= least) & np.isfinite(vertex[name])).all():
+        raise damaged(path, name, f"a value is not finite or below {least}")
     return torch.from_numpy(vertex[name].astype(kind))
 
 

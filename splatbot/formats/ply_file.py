@@ -26,6 +26,7 @@ from splatbot.formats.checks import MAX_GAUSSIANS, damaged
 Rows = NDArray[np.void]
 
 _MAX_HEADER = 2**20  # bytes
+_MAX_ELEMENTS, _MAX_PROPERTIES = 64, 4096  # of an element
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"}
 _TYPES |= {"float": "f4", "double": "f8"}
@@ -146,6 +147,10 @@ def _read_line(words: list[str], formats: list[str], elements: list[PlyElement])
             pass
         case ["format", name, "1.0"] if not formats:
             formats.append(_ORDERS[name])
+        case ["element", *_] if len(elements) == _MAX_ELEMENTS:
+            raise ValueError(f"more than {_MAX_ELEMENTS} elements")
+        case ["property", *_] if len(elements[-1].types) == _MAX_PROPERTIES:
+            raise ValueError(f"more than {_MAX_PROPERTIES} properties")
         case ["element", name, count] if name not in (element.name for element in elements):
             elements.append(PlyElement(name, int(count)))
         case ["property", "list", length, kind, name] if kind in _TYPES and name not in elements[-1].types:
@@ -169,13 +174,9 @@ def _read_rows(path: str | Path, file: BinaryIO, order: str, element: PlyElement
 
 
 def _read_binary(path: str | Path, file: BinaryIO, dtype: np.dtype[np.void], element: PlyElement) -> Rows:
-    """Map the rows into memory, so that columns are copied once."""
-    offset = file.tell()
-    count = (os.fstat(file.fileno()).st_size - offset) // dtype.itemsize
-    if count < element.count:
-        raise damaged(path, element.name, f"{count:,} of {element.count:,} rows")
-    rows = np.asarray(np.memmap(file, dtype, "r", offset, element.count))
-    file.seek(offset + rows.nbytes)
+    rows = np.fromfile(file, dtype, element.count)
+    if len(rows) < element.count:
+        raise damaged(path, element.name, f"{len(rows):,} of {element.count:,} rows")
     return rows
 
 

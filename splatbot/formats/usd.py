@@ -56,9 +56,10 @@ _REACH = 3.0  # [standard deviations] of the extent around a mean
 
 
 def load_usd(path: str | Path) -> GaussianModel:
-    """Read all prims of Gaussians of a .usd, .usda, .usdc or .usdz file at their poses, at the earliest time.
+    """Read all visible prims of Gaussians of a .usd, .usda, .usdc or .usdz file at their poses, at the earliest time.
 
-    Attributes that the file leaves out have the values of the schema: no rotation, scales of 1, opacity 1, grey.
+    Attributes that the file leaves out have the values of the schema: no rotation, scales of 1, opacity 1, grey of
+    degree 0.
 
     Raises:
         FormatError: the file is missing or damaged, needs other files, or holds no Gaussians.
@@ -72,13 +73,18 @@ def load_usd(path: str | Path) -> GaussianModel:
         raise FormatError(f"needs the file {facts['others'][0]:.80}.", file=path, field="references", hint=hint)
     if not facts["prims"]:
         hint = "give a file of Gaussian splats; meshes and points hold no Gaussians"
-        raise FormatError(f"has no prim {_TYPE}.", file=path, field=_TYPE, hint=hint)
+        raise FormatError(f"has no visible prim {_TYPE}.", file=path, field=_TYPE, hint=hint)
     T_world_stage = np.diag([facts["unit"]] * 3 + [1.0])
     if facts["up"] == "Z":
         T_world_stage = Y_UP_FROM_Z_UP @ T_world_stage
+    degrees = [_degree(path, prim, attributes) for prim, attributes in zip(facts["prims"], arrays, strict=True)]
+    counts = [_count(path, prim["path"], attributes) for prim, attributes in zip(facts["prims"], arrays, strict=True)]
+    check_count(path, sum(counts), POSITIONS)
+    decoded = 4 * (11 + 3 * (max(degrees) + 1) ** 2) * sum(counts)
+    check_expansion(path, decoded, Path(path).stat().st_size, POSITIONS)
     models = []
-    for prim, attributes in zip(facts["prims"], arrays, strict=True):
-        splats = _splats(path, prim["path"], prim["degree"], attributes)
+    for prim, attributes, degree in zip(facts["prims"], arrays, degrees, strict=True):
+        splats = _splats(path, prim["path"], degree, attributes)
         splats = place(path, splats, T_world_stage @ attributes["pose"], prim["path"])
         models.append(model_of(path, turn(splats, RUB)))
     return models[0] if len(models) == 1 else GaussianModel.concatenate(models)
@@ -158,7 +164,7 @@ def _read_prims(path: str | Path) -> tuple[dict[str, Any], list[dict[str, NDArra
         link, target = Path(folder) / f"map{suffix}", Path(folder) / "prims.npz"
         link.symlink_to(Path(path).resolve())  # OpenUSD chooses the format by the suffix
         memory, seconds = _MEMORY + MAX_EXPANSION * size, _SECONDS + size / _BYTES_PER_SECOND
-        words = [sys.executable, "-m", usd_prims.__name__, str(link), str(target), str(memory)]
+        words = [sys.executable, "-P", "-m", usd_prims.__name__, str(link), str(target), str(memory)]
         environment = os.environ | _ONE_THREAD | {"TMPDIR": folder}  # for the reports of OpenUSD on its own end
         try:
             done = subprocess.run(
@@ -185,14 +191,27 @@ def _reason(done: subprocess.CompletedProcess[bytes]) -> str:
     return done.stderr.decode("utf-8", "replace").strip().rpartition("\n")[2].strip()
 
 
-def _splats(path: str | Path, prim: str, degree: int, attributes: dict[str, NDArray[Any]]) -> SplatArrays:
-    """Return the Gaussians of a prim in its axes."""
+def _degree(path: str | Path, prim: dict[str, Any], attributes: dict[str, NDArray[Any]]) -> int:
+    """Return the degree of the harmonics of a prim; absent ones have degree 0."""
+    degree = int(prim["degree"])
     if not 0 <= degree <= _MAX_READ_DEGREE:
         hint = f"export the map with a degree of at most {_MAX_READ_DEGREE}"
-        raise FormatError(f"is {degree}.", file=path, field=f"{prim}.{DEGREE}", hint=hint)
-    count, terms = len(attributes.get(POSITIONS, ())), (degree + 1) ** 2
-    check_count(path, count, f"{prim}.{POSITIONS}")
-    check_expansion(path, 4 * (11 + 3 * terms) * count, Path(path).stat().st_size, f"{prim}.{POSITIONS}")
+        raise FormatError(f"is {degree}.", file=path, field=f"{prim['path']}.{DEGREE}", hint=hint)
+    return degree if SH in attributes else 0
+
+
+def _count(path: str | Path, prim: str, attributes: dict[str, NDArray[Any]]) -> int:
+    """Return the number of Gaussians of a prim."""
+    positions = attributes.get(POSITIONS, np.zeros((0, 3)))
+    if positions.ndim != 2 or positions.shape[1] != 3:
+        raise damaged(path, f"{prim}.{POSITIONS}", "is no array of points")
+    check_count(path, len(positions), f"{prim}.{POSITIONS}")
+    return len(positions)
+
+
+def _splats(path: str | Path, prim: str, degree: int, attributes: dict[str, NDArray[Any]]) -> SplatArrays:
+    """Return the Gaussians of a prim in its axes."""
+    count, terms = len(attributes[POSITIONS]), (degree + 1) ** 2
 
     def values(name: str, default: float | tuple[float, ...], *shape: int) -> Table:
         """Return an attribute of this shape, or the default; values beyond it have no meaning in the schema."""

@@ -20,7 +20,7 @@ Arrays = dict[str, np.ndarray[Any, np.dtype[Any]]]
 
 
 def main(source: str, target: str, memory: str) -> None:
-    """Write the prims of Gaussians of a file as arrays of numpy.
+    """Write the visible prims of Gaussians of a file, also those of instances, as arrays of numpy.
 
     The arrays are named after the number of the prim and the attribute; `pose` is T_stage_prim (4, 4). The text `facts`
     is JSON: `others` are the files that the layer needs, in which case nothing else is read.
@@ -29,13 +29,15 @@ def main(source: str, target: str, memory: str) -> None:
     from pxr import Sdf, Usd, UsdGeom
 
     layer = Sdf.Layer.FindOrOpen(source)
-    facts: dict[str, Any] = {"others": list(layer.GetCompositionAssetDependencies())}
+    others = [name for name in layer.GetCompositionAssetDependencies() if name]  # the layer itself has no name
+    facts: dict[str, Any] = {"others": others}
     content: dict[str, Any] = {}
     if not facts["others"]:
         stage = Usd.Stage.Open(layer)
         facts |= {"unit": UsdGeom.GetStageMetersPerUnit(stage), "up": UsdGeom.GetStageUpAxis(stage), "prims": []}
         poses = UsdGeom.XformCache(Usd.TimeCode.EarliestTime())
-        for index, prim in enumerate(prim for prim in stage.Traverse() if _holds_gaussians(prim)):
+        prims = stage.Traverse(Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate))
+        for index, prim in enumerate(prim for prim in prims if _holds_gaussians(prim) and _is_visible(prim)):
             facts["prims"].append({"path": str(prim.GetPath()), "degree": int(prim.GetAttribute(DEGREE).Get())})
             pose = np.array(poses.GetLocalToWorldTransform(prim)).T  # OpenUSD multiplies rows from the left
             content |= {f"{index} {name}": values for name, values in (_attributes(prim) | {"pose": pose}).items()}
@@ -46,6 +48,12 @@ def _holds_gaussians(prim: Any) -> bool:
     from pxr import UsdVol
 
     return bool(prim.IsA(UsdVol.ParticleField3DGaussianSplat))
+
+
+def _is_visible(prim: Any) -> bool:
+    from pxr import Usd, UsdGeom
+
+    return bool(UsdGeom.Imageable(prim).ComputeVisibility(Usd.TimeCode.EarliestTime()) != UsdGeom.Tokens.invisible)
 
 
 def _attributes(prim: Any) -> Arrays:

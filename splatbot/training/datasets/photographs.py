@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -18,15 +20,21 @@ MIN_PHOTOGRAPHS, MAX_PHOTOGRAPHS = 3, 2000
 USUAL_FRAMES = 150  # of a video
 
 _SUFFIXES = (".jpg", ".jpeg", ".png")
+_OTHERS = (".heic", ".heif", ".avif", ".webp", ".tif", ".tiff", ".bmp", ".gif", ".dng", ".cr2", ".cr3", ".nef", ".arw")
+_WHOLE = 0.95  # share of the stated frames below which a video counts as cut off
 _JPEG_QUALITY = 95
 _WIDTH = 640  # [px] at which sharpness is measured, where noise of single pixels is small
 
 Bgr = NDArray[np.uint8]
 Report = Callable[[str, float], None]
 
+_log = logging.getLogger(__name__)
+
 
 def collect_photographs(source: Path, folder: Path, frames: int | None, report: Report) -> list[str]:
     """Copy images, or frames of a video, to a folder that exists, and return their names.
+
+    Hidden files are left out. Warnings count images of other formats, and the frames of a video that is cut off.
 
     Args:
         source: a folder with .jpg and .png files, or a video.
@@ -35,22 +43,44 @@ def collect_photographs(source: Path, folder: Path, frames: int | None, report: 
         report: is called with the name of the step and its finished share.
 
     Raises:
-        InputError: there are too few or too many images.
+        InputError: there are too few or too many images, or a name is not UTF-8.
         LogError: the video or an image is damaged.
+        FormatError: an image is larger than 64 megapixels.
     """
     if not source.is_dir():
         return _frames_of_video(source, folder, frames or USUAL_FRAMES, report)
-    files = sorted(file for file in source.iterdir() if file.suffix.lower() in _SUFFIXES)
+    files = sorted(_images(source))
     _check_count(source, min(len(files), frames or len(files)), "images")
     if frames is not None and frames < len(files):
         report_read = _reporter(report, "reading images", len(files))
-        images = (read_color(file) for file in files)
+        images = (_read(file) for file in files)
         files = [files[index] for index, _ in _sharpest(images, len(files), frames, report_read)]
     for index, file in enumerate(files):
         report("copying images", index / len(files))
-        photo_size(file)  # refuses damaged images before the work begins
+        _read(file)  # refuses damaged images before COLMAP runs
         shutil.copyfile(file, folder / file.name)
     return [file.name for file in files]
+
+
+def _images(folder: Path) -> list[Path]:
+    """List the images of a folder; raises InputError for a name that the database of COLMAP cannot hold."""
+    visible = [file for file in folder.iterdir() if not file.name.startswith(".")]
+    others = sum(file.suffix.lower() in _OTHERS for file in visible)
+    if others:
+        _log.warning("%s: %d images of other formats are left out; convert them to .jpg or .png", folder, others)
+    images = [file for file in visible if file.suffix.lower() in _SUFFIXES]
+    for file in images:
+        try:
+            file.name.encode()
+        except UnicodeEncodeError as error:
+            name = os.fsencode(file.name).decode(errors="replace")
+            raise InputError("has a name that is not UTF-8.", file=folder, field=name, hint="rename it") from error
+    return images
+
+
+def _read(file: Path) -> Bgr:
+    photo_size(file)  # bounds the pixels before they are decoded
+    return read_color(file)
 
 
 def sharpness(image: Bgr) -> float:
@@ -62,15 +92,17 @@ def sharpness(image: Bgr) -> float:
 
 
 def _frames_of_video(video: Path, folder: Path, frames: int, report: Report) -> list[str]:
-    capture = cv2.VideoCapture(str(video))
+    capture = cv2.VideoCapture(str(video.absolute()))  # no name is an address
     try:
         total = int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) if capture.isOpened() else 0
         if total <= 0:
             hint = "give a video that OpenCV reads (.mp4, .mov, .avi), or a folder of images"
             raise LogError("is no video, or states no number of frames.", file=video, field="video", hint=hint)
-        _check_count(video, min(total, frames), "frames")
+        count = min(total, frames)
+        _check_count(video, count, "frames")
         names = []
-        for index, image in _sharpest(_decoded(capture), total, frames, _reporter(report, "reading frames", total)):
+        images = _decoded(video, capture, total)
+        for index, image in _sharpest(images, total, count, _reporter(report, "reading frames", total)):
             names.append(f"frame_{index:06d}.jpg")
             if not cv2.imwrite(str(folder / names[-1]), image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]):
                 raise OSError(None, "cannot be written", str(folder / names[-1]))
@@ -80,21 +112,31 @@ def _frames_of_video(video: Path, folder: Path, frames: int, report: Report) -> 
         capture.release()
 
 
-def _decoded(capture: cv2.VideoCapture) -> Iterator[Bgr]:
+def _decoded(video: Path, capture: cv2.VideoCapture, total: int) -> Iterator[Bgr]:
+    """Yield the frames of a video; a warning is logged if they are clearly fewer than the stated total."""
+    read = 0
     while (frame := capture.read())[0]:
+        read += 1
         yield np.asarray(frame[1], np.uint8)
+    if read < _WHOLE * total:
+        problem = "%s: only %d of the stated %d frames can be decoded; if the file is cut off, copy it again"
+        _log.warning(problem, video, read, total)
 
 
 def _sharpest(images: Iterable[Bgr], total: int, count: int, read: Callable[[int], None]) -> Iterator[tuple[int, Bgr]]:
-    """Yield index and image of the sharpest image of each of ``count`` equal intervals of ``total`` images."""
+    """Yield index and image of the sharpest image of each of ``count`` equal intervals of ``total`` images.
+
+    Images beyond the total are of the last interval, so that at most ``count`` images are taken.
+    """
     best: tuple[float, int, Bgr] | None = None
     interval = 0
     for index, image in enumerate(images):
         read(index)
-        if index * count // total != interval and best is not None:
+        current = min(count - 1, index * count // total)
+        if current != interval and best is not None:
             yield best[1:]
             best = None
-        interval = index * count // total
+        interval = current
         found = sharpness(image)
         if best is None or found > best[0]:
             best = found, index, image

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -74,29 +77,29 @@ def pose_photographs(
         report(f"COLMAP {step}", index / len(steps))
         _run([*colmap, step, "--database_path", str(database), *options], scene / LOG_NAME, step)
     database.unlink(missing_ok=True)
-    found = {model: _count(model) for model in models.iterdir() if model.is_dir()}
+    files = [file for suffix in (".bin", ".txt") for file in models.glob(f"*/images{suffix}")]
+    found = {file.parent: len(read_images(file)) for file in files}
     if not found:
         raise LogError("finds no poses.", field="colmap", hint=_OVERLAP)
     best = max(sorted(found), key=lambda model: found[model])
-    for model in found.keys() - {best}:
-        shutil.rmtree(model)
+    for other in {place for place in models.iterdir() if place.is_dir()} - {best}:
+        shutil.rmtree(other)
     best.rename(models / "0")
     return Posed(found[best], len(found))
-
-
-def _count(model: Path) -> int:
-    return len(read_images(next(file for file in model.iterdir() if file.stem == "images")))
 
 
 def _run(words: list[str], log: Path, step: str) -> None:
     with (
         log.open("ab") as output,
-        subprocess.Popen(words, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT) as process,
+        subprocess.Popen(
+            words, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT, start_new_session=True
+        ) as process,
     ):
         try:
             code = process.wait()
         except BaseException:  # of Ctrl-C
-            process.kill()
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)  # `colmap` may be a script that starts the program
             process.wait()
             raise
     if code:

@@ -142,6 +142,15 @@ def test_the_threads_and_settings_of_an_item_are_those_of_the_batch(
     assert expected | {str(tmp_path)} <= shown
 
 
+def test_a_module_in_the_current_folder_does_not_run_in_an_item(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "threading.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')\n")
+    monkeypatch.chdir(tmp_path)
+    assert run(tmp_path / "batch", BatchItem("item", LISTS))["item"].finished
+    assert not (tmp_path / "ran").exists()
+
+
 def test_a_worker_that_is_lost_is_the_error_of_its_item(tmp_path: Path) -> None:
     lost: Future[ItemRecord] = Future()
     lost.set_exception(RuntimeError("the node died"))

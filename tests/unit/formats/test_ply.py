@@ -233,6 +233,19 @@ def test_opacity_of_exactly_one_and_scale_of_exactly_zero_become_finite(
     assert len(caplog.records) == 2
 
 
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("uncertainty", np.nan), ("uncertainty", np.inf), ("uncertainty", -1), ("observations", -1), ("misses", -1)],
+)
+def test_impossible_bookkeeping_is_refused(tmp_path: Path, name: str, value: float) -> None:
+    path = tmp_path / "map.ply"
+    save_ply(random_model(), path, bookkeeping=True)
+    edit(path, **{name: value})
+    with pytest.raises(FormatError, match="damaged") as caught:
+        load_ply(path)
+    assert (caught.value.file, caught.value.field) == (str(path), name)
+
+
 def test_an_impossible_number_of_coefficients_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "map.ply"
     save_ply(random_model(degree=1), path)

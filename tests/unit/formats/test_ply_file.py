@@ -136,6 +136,31 @@ def test_wrong_lines_of_a_header_are_quoted(tmp_path: Path, lines: list[str]) ->
 
 
 @pytest.mark.parametrize(
+    "lines",
+    [
+        [f"element e{index} 0" for index in range(65)],
+        ["element vertex 0", *(f"property float p{index}" for index in range(4097))],
+    ],
+)
+def test_headers_of_too_many_elements_or_properties_are_refused(tmp_path: Path, lines: list[str]) -> None:
+    write = (tmp_path / "a.ply").write_bytes
+    write(header(*lines[:-1]))
+    read_ply_header(tmp_path / "a.ply")
+    write(header(*lines))
+    with pytest.raises(FormatError, match="more than"):
+        read_ply_header(tmp_path / "a.ply")
+
+
+def test_rows_do_not_change_with_the_file(tmp_path: Path) -> None:
+    rows = rows_of_all_types()
+    write_ply(tmp_path / "a.ply", {"vertex": rows})
+    found = read_ply(tmp_path / "a.ply", ["vertex"])["vertex"]
+    with (tmp_path / "a.ply").open("r+b") as file:  # in place, as `rsync --inplace` does
+        file.write(bytes((tmp_path / "a.ply").stat().st_size))
+    assert found.tobytes() == rows.tobytes()
+
+
+@pytest.mark.parametrize(
     "content",
     [
         b"",

@@ -173,6 +173,66 @@ def test_several_prims_become_one_map(tmp_path: Path) -> None:
     assert load_usd(path).means.tolist() == [[1, -2, -3]] * 2
 
 
+@pytest.mark.parametrize("own", [True, False])
+def test_invisible_prims_are_skipped(tmp_path: Path, own: bool) -> None:
+    hidden = 'token visibility = "invisible"'
+    path = write_usda(tmp_path / "a.usda", body=hidden if own else "", outer="" if own else hidden)
+    with pytest.raises(FormatError, match="no visible prim"):
+        load_usd(path)
+    shown = write_usda(tmp_path / "b.usda").read_text()
+    path.write_text(path.read_text() + shown[shown.index("def Xform") :].replace('"World"', '"Other"'))
+    assert len(load_usd(path)) == 1
+
+
+def test_each_instance_of_a_prim_is_read_at_its_pose(tmp_path: Path) -> None:
+    path = tmp_path / "a.usda"
+    instance = (
+        'def Xform "I{0}" (\ninstanceable = true\nreferences = </_Shelf>\n)\n{{\n'
+        'double3 xformOp:translate = ({0}, 0, 0)\nuniform token[] xformOpOrder = ["xformOp:translate"]\n}}\n'
+    )
+    path.write_text(
+        '#usda 1.0\n(\nmetersPerUnit = 1\nupAxis = "Y"\n)\nclass Xform "_Shelf"\n{\n'
+        'def ParticleField3DGaussianSplat "Splats"\n{\npoint3f[] positions = [(1, 2, 3)]\n}\n}\n'
+        + instance.format(10)
+        + instance.format(20)
+    )
+    assert sorted(load_usd(path).means.tolist()) == [[11, -2, -3], [21, -2, -3]]
+
+
+def test_absent_harmonics_have_degree_0(tmp_path: Path) -> None:
+    assert load_usd(write_usda(tmp_path / "a.usda")).sh.shape == (1, 1, 3)
+
+
+def test_the_decoded_size_of_all_prims_together_is_bounded(tmp_path: Path) -> None:
+    stage = Usd.Stage.CreateNew(str(tmp_path / "a.usdc"))
+    for index in range(70):  # 78 MB of zeros together, which the file stores once
+        prim = UsdVol.ParticleField3DGaussianSplat.Define(stage, f"/Splats{index}").GetPrim()
+        prim.GetAttribute("positions").Set(Vt.Vec3fArray(20_000))
+    stage.Save()
+    with pytest.raises(FormatError, match=f"claims {70 * 20_000 * (3 + 4 + 3 + 1 + 3) * 4:,} bytes") as caught:
+        load_usd(tmp_path / "a.usdc")
+    assert caught.value.field == "positions"
+
+
+def test_a_module_in_the_current_folder_does_not_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_usda(tmp_path / "a.usda")
+    (tmp_path / "resource.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')\n")
+    monkeypatch.chdir(tmp_path)
+    assert len(load_usd(path)) == 1
+    assert not (tmp_path / "ran").exists()
+
+
+@pytest.mark.parametrize(
+    "positions", ["point3f positions = (1, 2, 3)", "float positions = 1", "float[] positions = [1]"]
+)
+def test_positions_that_are_no_array_of_points_are_refused(tmp_path: Path, positions: str) -> None:
+    path = write_usda(tmp_path / "a.usda")
+    path.write_text(path.read_text().replace("point3f[] positions = [(1, 2, 3)]", positions))
+    with pytest.raises(FormatError, match="damaged") as caught:
+        load_gaussians(path)
+    assert (caught.value.file, caught.value.field) == (str(path), "/World/Splats.positions")
+
+
 SCALED = 'float3 xformOp:scale = ({}, 1, 2)\nuniform token[] xformOpOrder = ["xformOp:scale"]'
 
 
@@ -212,7 +272,7 @@ def test_files_without_gaussians_and_files_that_need_others_are_refused(tmp_path
     stage = Usd.Stage.CreateNew(str(tmp_path / "points.usda"))
     UsdGeom.Points.Define(stage, "/Points")
     stage.Save()
-    with pytest.raises(FormatError, match="no prim ParticleField3DGaussianSplat"):
+    with pytest.raises(FormatError, match="no visible prim ParticleField3DGaussianSplat"):
         load_gaussians(tmp_path / "points.usda")
     save_usd(detailed_model(3), tmp_path / "map.usdc")
     for arc in ("subLayers = [@./map.usdc@]", "subLayers = [@/etc/passwd@]"):

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -17,6 +20,7 @@ from numpy.typing import NDArray
 
 from splatbot.camera import Camera
 from splatbot.cli import main
+from splatbot.cli.prepare import _replace
 from splatbot.errors import InputError, LogError
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import look_at
@@ -212,19 +216,127 @@ def test_without_colmap_one_sentence_names_the_extra(monkeypatch: pytest.MonkeyP
         find_colmap()
 
 
-def test_ctrl_c_ends_colmap_and_leaves_nothing(tmp_path: Path, images: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGHUP])
+def test_a_signal_ends_colmap_with_its_children_and_leaves_nothing(
+    tmp_path: Path, images: Path, monkeypatch: pytest.MonkeyPatch, end: signal.Signals
+) -> None:
     record = install(tmp_path, monkeypatch, pause=60)
-    words = [sys.executable, "-m", "splatbot", "prepare", str(images), "--out", str(tmp_path / "scene")]
+    program = tmp_path / "bin" / "colmap"
+    program.rename(program.with_name("child"))
+    program.write_text('#!/bin/sh\n"$0/../child" "$@"\nexit $?\n'.replace("$0/..", str(program.parent)))
+    program.chmod(0o755)
+    words = ["env", "--default-signal=HUP", sys.executable, "-m", "splatbot", "prepare", str(images)]
+    words += ["--out", str(tmp_path / "scene")]
     with subprocess.Popen(words, stderr=subprocess.PIPE, start_new_session=True) as process:
         while not (record.is_file() and "mapper" in record.read_text()):
             assert process.poll() is None
             time.sleep(0.05)
-        process.send_signal(signal.SIGINT)
+        process.send_signal(end)
         _, error = process.communicate(timeout=30)
     assert (process.returncode, error.splitlines()[-1]) == (130, b"interrupted")
     assert sorted(place.name for place in tmp_path.iterdir()) == ["bin", "photographs", "steps.jsonl"]
-    with pytest.raises(ProcessLookupError):
-        os.kill(json.loads(record.read_text().splitlines()[-1])[0], 0)
+    child = Path("/proc") / str(json.loads(record.read_text().splitlines()[-1])[0]) / "cmdline"
+    deadline = time.monotonic() + 10
+    while child.exists() and child.read_bytes():  # a zombie has no command line
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def test_a_replaced_scene_may_be_a_link_to_another_disk_with_linked_photographs(
+    tmp_path: Path, images: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    install(tmp_path, monkeypatch, models=1)
+    with tempfile.TemporaryDirectory(dir="/dev/shm") as disk:
+        home, out, originals = Path(disk) / "scene", tmp_path / "scene", tmp_path / "originals"
+        home.mkdir()
+        out.symlink_to(home)
+        words = ["prepare", str(images), "--out", str(out), "--quiet", "--overwrite"]
+        assert main([*words, "--frames", "3"]) == 0
+        shutil.move(home / "images", originals)
+        (home / "images").symlink_to(originals)
+        (home / "colmap.log").unlink()
+        (home / "colmap.log").mkdir()  # in place of a file
+        assert main(words) == 0
+        assert out.is_symlink()
+        assert sorted(place.name for place in home.iterdir()) == ["colmap.log", "images", "sparse"]
+        assert not (home / "images").is_symlink()
+        assert (len(list((home / "images").iterdir())), len(list(originals.iterdir()))) == (5, 3)
+        assert (home / "colmap.log").is_file()
+
+
+def test_an_error_while_a_scene_is_replaced_restores_the_earlier_one(tmp_path: Path) -> None:
+    scene, out = tmp_path / "draft", tmp_path / "scene"
+    for place in (scene, out):
+        for name in ("images", "sparse"):
+            (place / name).mkdir(parents=True)
+            (place / name / place.name).touch()
+    with pytest.raises(FileNotFoundError):  # the draft has no colmap.log
+        _replace(scene, out)
+    assert sorted(str(place.relative_to(out)) for place in out.rglob("*")) == [
+        "images",
+        "images/scene",
+        "sparse",
+        "sparse/scene",
+    ]
+
+
+def test_smaller_copies_of_earlier_photographs_go_with_them(
+    tmp_path: Path, images: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    install(tmp_path, monkeypatch, models=1)
+    words = ["prepare", str(images), "--out", str(tmp_path / "scene"), "--quiet", "--overwrite"]
+    assert main(words) == 0
+    for name in ("images_2", "images_4", "images_of_mine"):
+        (tmp_path / "scene" / name).mkdir()
+    assert main(words) == 0
+    assert sorted(place.name for place in (tmp_path / "scene").iterdir()) == [
+        "colmap.log",
+        "images",
+        "images_of_mine",
+        "sparse",
+    ]
+
+
+@pytest.mark.parametrize("name", ["depth", "depths"])
+def test_a_scene_with_depth_images_is_not_replaced(
+    tmp_path: Path, images: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    record = install(tmp_path, monkeypatch, models=1)
+    words = ["prepare", str(images), "--out", str(tmp_path / "scene"), "--quiet", "--overwrite"]
+    assert main(words) == 0
+    (tmp_path / "scene" / name).mkdir()
+    record.unlink()
+    assert main(words) == 2
+    assert f"scene/{name}" in "".join(capsys.readouterr().err.split())
+    assert not record.exists()  # refused before COLMAP runs
+
+
+def test_a_mounted_folder_of_photographs_is_refused_before_colmap_runs(
+    tmp_path: Path, images: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    record = install(tmp_path, monkeypatch, models=1)
+    out = tmp_path / "scene"
+    words = ["prepare", str(images), "--out", str(out), "--quiet", "--overwrite"]
+    assert main(words) == 0
+    record.unlink()
+    namespace = ["unshare", "--user", "--map-root-user", "--mount", "sh", "-c"]
+    if subprocess.run([*namespace, "mount -t tmpfs none /mnt"], capture_output=True).returncode:
+        pytest.skip("this system lets no process mount a folder of its own")
+    script = f'mount -t tmpfs none {out}/images && exec {sys.executable} -m splatbot "$@"'
+    done = subprocess.run([*namespace, script, "sh", *words], capture_output=True, text=True)
+    assert done.returncode == 2
+    assert "is on another disk" in done.stderr
+    assert not record.exists()
+
+
+def test_a_model_without_images_is_skipped(tmp_path: Path, images: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    install(tmp_path, monkeypatch, models=2)
+    program = tmp_path / "bin" / "colmap"
+    cut = '        if number == 0:\n            (model / "images.bin").unlink()\n'
+    program.write_text(program.read_text().replace("else:\n    Path", f"{cut}else:\n    Path"))
+    assert main(["prepare", str(images), "--out", str(tmp_path / "scene"), "--quiet"]) == 0
+    assert [place.name for place in (tmp_path / "scene" / "sparse").iterdir()] == ["0"]
+    assert len(open_dataset(tmp_path / "scene").views) == 4
 
 
 def test_the_sharpest_frame_of_each_interval_is_taken(tmp_path: Path) -> None:
@@ -286,3 +398,66 @@ def test_a_file_that_is_no_video_is_refused(tmp_path: Path) -> None:
     with pytest.raises(LogError, match="is no video") as caught:
         collect_photographs(tmp_path / "a.mp4", tmp_path, None, ignore)
     assert caught.value.file == str(tmp_path / "a.mp4")
+
+
+def test_a_video_that_ends_before_its_stated_length_is_named_in_a_warning(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    write_video(tmp_path / "a.avi", blurred=set())
+    (tmp_path / "out").mkdir()
+    assert len(collect_photographs(tmp_path / "a.avi", tmp_path / "out", 10, ignore)) == 10
+    assert not caplog.text
+    whole = (tmp_path / "a.avi").read_bytes()
+    (tmp_path / "a.avi").write_bytes(whole[: len(whole) // 2])
+    assert len(collect_photographs(tmp_path / "a.avi", tmp_path / "out", 10, ignore)) in (5, 6)
+    assert re.search(r"a\.avi: only 1\d of the stated 30 frames can be decoded", caplog.text)
+
+
+def test_frames_beyond_the_stated_length_do_not_add_photographs(tmp_path: Path) -> None:
+    write_video(tmp_path / "a.avi", blurred=set(range(30)) - {1, 3, 6})
+    content = bytearray((tmp_path / "a.avi").read_bytes())
+    length = content.index(b"strh") + 8 + 32  # dwLength of AVISTREAMHEADER
+    assert content[length : length + 4] == (30).to_bytes(4, "little")
+    content[length : length + 4] = (6).to_bytes(4, "little")
+    (tmp_path / "a.avi").write_bytes(content)
+    (tmp_path / "out").mkdir()
+    names = collect_photographs(tmp_path / "a.avi", tmp_path / "out", 3, ignore)
+    assert names == ["frame_000001.jpg", "frame_000003.jpg", "frame_000006.jpg"]  # OpenCV decodes 7 of them
+
+
+def test_a_damaged_photograph_is_refused_before_colmap_runs(tmp_path: Path, images: Path) -> None:
+    content = (images / "3.png").read_bytes()
+    (images / "3.png").write_bytes(content[: len(content) // 2])  # its header is whole
+    (tmp_path / "out").mkdir()
+    with pytest.raises(LogError, match=r"3\.png"):
+        collect_photographs(images, tmp_path / "out", None, ignore)
+
+
+def test_hidden_files_are_skipped_and_images_of_other_formats_are_counted(
+    tmp_path: Path, images: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    for name in ("._0.png", "IMG_1.HEIC", "b.webp", "notes.txt"):
+        (images / name).write_bytes(b"no image")
+    (tmp_path / "out").mkdir()
+    assert len(collect_photographs(images, tmp_path / "out", None, ignore)) == 5
+    assert "2 images of other formats are left out" in caplog.text
+
+
+def test_a_name_that_is_not_utf_8_is_refused(tmp_path: Path, images: Path) -> None:
+    (images / "0.png").rename(images / os.fsdecode(b"caf\xe9.png"))
+    (tmp_path / "out").mkdir()
+    with pytest.raises(InputError, match="not UTF-8") as caught:
+        collect_photographs(images, tmp_path / "out", None, ignore)
+    assert str(caught.value).encode()
+
+
+def test_a_video_with_the_name_of_an_address_is_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    writer = cv2.VideoWriter(str(tmp_path / "a.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 10, (64, 48))
+    for index in range(6):
+        writer.write(np.full((48, 64, 3), 20 * index, np.uint8))
+    writer.release()
+    (tmp_path / "a.mp4").rename(tmp_path / "data:a.mp4")
+    (tmp_path / "out").mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert not cv2.VideoCapture("data:a.mp4").isOpened()
+    assert len(collect_photographs(Path("data:a.mp4"), tmp_path / "out", 3, ignore)) == 3
