@@ -111,6 +111,13 @@ class ServedMap:
         return self.snapshot.model.nbytes if self.snapshot else 0
 
     @property
+    def sh_degree(self) -> int:
+        """Degree of the spherical harmonics, 0 before the first state."""
+        if self.tiles is not None:
+            return self.tiles.index.sh_degree
+        return self.snapshot.model.sh_degree if self.snapshot else 0
+
+    @property
     def ready(self) -> Snapshot:
         """The snapshot.
 
@@ -144,13 +151,16 @@ class ServedMap:
         """
         return self.ready.model if self.tiles is None else self.tiles.overview()
 
-    def in_view(self, camera: Camera, T_world_camera: Array) -> GaussianModel:
-        """Return the Gaussians that draw a view.
+    def in_view(self, camera: Camera, T_world_camera: Array) -> tuple[GaussianModel, float]:
+        """Return the Gaussians that draw a view, and its pixel error [px]: 0 unless some of them are merged.
 
         Raises:
             MapNotReadyError: nothing is published yet.
         """
-        return self.ready.model if self.tiles is None else self.tiles.in_view(camera, T_world_camera).model
+        if self.tiles is None:
+            return self.ready.model, 0.0
+        view = self.tiles.in_view(camera, T_world_camera)
+        return view.model, view.pixel_error
 
 
 class MapStore:
@@ -274,7 +284,8 @@ class MapStore:
         with self._lock:
             removed = self._find(map_id, generation)
             del self._maps[map_id]
-            self.bus.publish(map_topic(map_id, REMOVED), removed)
+            closing = replace(removed, tiles=None)  # readers alone keep the file open
+            self.bus.publish(map_topic(map_id, REMOVED), closing)
             self.bus.forget(map_topic(map_id, ""))
 
     def get(self, map_id: str, *, generation: int | None = None) -> ServedMap:

@@ -6,15 +6,13 @@ from typing import Annotated, Any
 
 import numpy as np
 from fastapi import APIRouter, Depends, Request, Response
-from numpy.typing import NDArray
 
-from splatbot.collision import RobotSpheres
 from splatbot.services.codecs import answer, answers, body_of, request_body
 from splatbot.services.dependencies import ServedAfterFrames, Settings, problems
 from splatbot.services.problems import TooLargeError
 from splatbot.services.robots_in_maps import arm_in
 from splatbot.services.schemas import BASE_EXAMPLE, CollisionsRequest
-from splatbot.tiles import TiledField, TiledMap
+from splatbot.services.tiled_fields import field_around
 
 router = APIRouter(prefix="/v1/maps", tags=["collision"])
 
@@ -38,7 +36,6 @@ _ANSWER = {
     "gaussian": [977],
     "gradient": [[0.0, -0.02, 0.0, 0.1, 0.0, 0.05, 0.0]],
 }
-_REACH = 1.0  # [m] farther clearances are unknown in a tiled map
 _VALUES_A_ROW = 20  # its list and up to 15 joints
 _Body = Annotated[
     CollisionsRequest,
@@ -63,7 +60,10 @@ def collisions(request: Request, served: ServedAfterFrames, settings: Settings, 
         hint = "split the request, or raise SPLATBOT_MAX_CONFIGURATIONS"
         raise TooLargeError(f"has more than {settings.max_configurations} rows.", field="q", hint=hint)
     _, arm = arm_in(served, query.robot, query.base, query.margin, query.opening)
-    tiled = None if served.tiles is None else _field_around(served.tiles, arm, query.q)
+    tiled = None
+    if served.tiles is not None:
+        room = float(arm.spheres.radii.max()) + arm.margin
+        tiled = field_around(served.tiles, arm.centers(query.q).reshape(-1, 3), "q", room=room)
     field, cut = (served.field, np.inf) if tiled is None else (tiled.field, tiled.reach)
     verdict, clearance = arm.check(field, query.q), arm.clearance(field, query.q, cut=cut)
     body: dict[str, Any] = {
@@ -78,10 +78,3 @@ def collisions(request: Request, served: ServedAfterFrames, settings: Settings, 
     if query.gradient:
         body["gradient"] = clearance.gradient
     return answer(request, body, array="in_collision")
-
-
-def _field_around(tiles: TiledMap, arm: RobotSpheres, q: NDArray[np.float64]) -> TiledField:
-    """Return the field of a box that holds all spheres of an arm at configurations (C, J)."""
-    centres = arm.centers(q).reshape(-1, 3) if len(q) else np.zeros((1, 3))
-    room = float(arm.spheres.radii.max()) + arm.margin
-    return tiles.field(centres.min(axis=0) - room, centres.max(axis=0) + room, reach=_REACH)

@@ -9,11 +9,13 @@ from fastapi import APIRouter, Depends, Request, Response
 from numpy.typing import NDArray
 
 from splatbot.collision import MahalanobisResult
+from splatbot.collision.inputs import spheres
 from splatbot.services.codecs import answer, answers, body_of, request_body
 from splatbot.services.dependencies import ServedAfterFrames, Settings, problems
 from splatbot.services.problems import TooLargeError
 from splatbot.services.schemas import DistanceRequest
 from splatbot.services.store import ServedMap
+from splatbot.services.tiled_fields import REACH, field_around
 
 router = APIRouter(prefix="/v1/maps", tags=["collision"])
 
@@ -29,7 +31,6 @@ _ANSWER = {
     "index": [1042, 977],
     "inside": [True, False],
 }
-_CUT = 1.0  # [m] farther distances are infinite, which saves most of their time
 _N_SIGMA = 2.0  # of motions
 _VALUES_A_POINT = 8  # its list and three numbers
 _Body = Annotated[
@@ -60,7 +61,7 @@ def distance(request: Request, served: ServedAfterFrames, settings: Settings, qu
         )
     points = query.points.reshape(-1, 3)
     found, metres = _nearest(served, points, query.n_sigma)
-    metres[metres >= _CUT] = np.inf
+    metres[metres >= REACH] = np.inf
     body = {
         "map_version": served.map_version,
         "n_sigma": query.n_sigma,
@@ -81,9 +82,8 @@ def _nearest(
         found = served.field.mahalanobis(points)
         if n_sigma != _N_SIGMA:
             return found, unknown
-        return found, served.field.clearance(points, cut=_CUT).distance.astype(np.float32)
-    around = points if len(points) else np.zeros((1, 3))
-    field = served.tiles.field(around.min(axis=0), around.max(axis=0), n_sigma, reach=_CUT)
+        return found, served.field.clearance(points, cut=REACH).distance.astype(np.float32)
+    field = field_around(served.tiles, spheres(points)[0], "points", n_sigma=n_sigma)
     if n_sigma != _N_SIGMA:
         return field.mahalanobis(points), unknown
     return field.mahalanobis(points), field.clearance(points).distance.astype(np.float32)

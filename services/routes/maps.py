@@ -305,7 +305,7 @@ def _info(served: ServedMap) -> MapInfo:
         source=served.source,
         gaussians=served.gaussians,
         bytes=served.nbytes,
-        sh_degree=served.overview().sh_degree if served.map_version else 0,
+        sh_degree=served.sh_degree,
         stamp=snapshot.stamp if snapshot else 0.0,
         bounds=None if box is None else Bounds(low=box[0], high=box[1]),
         robot=None if served.mask is None else _masked(served.mask),

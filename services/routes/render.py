@@ -28,7 +28,11 @@ from splatbot.services.store import ServedMap
 router = APIRouter(prefix="/v1/maps", tags=["views"])
 
 _PNG: dict[int | str, dict[str, Any]] = {
-    200: {"content": {"image/png": {}}, "description": "PNG; X-Map-Version and ETag name the state that was drawn"}
+    200: {
+        "content": {"image/png": {}},
+        "description": "PNG; X-Map-Version and ETag name the state that was drawn, X-Pixel-Error the size of its "
+        "merged details [px]: 0 for a map in memory",
+    }
 }
 _EXAMPLES: dict[str, Any] = {
     "default view": {"mode": "rgb"},
@@ -71,19 +75,29 @@ def render_default(
 )
 def render(served: ServedAfterFrames, settings: Settings, request: _Body) -> Response:
     """Render the map for a given camera and pose."""
-    model = served.overview()
+    camera = pose = None
     if request.camera is not None:
         check_size(request.camera.width, request.camera.height, settings)
         camera = Camera(**request.camera.model_dump())
-        _, pose = default_view(model, width=camera.width, height=camera.height, fov_deg=_fov_deg(camera))
-    else:
-        camera, pose = default_view(model)
     if request.T_world_camera is not None:
         pose = np.asarray(request.T_world_camera, dtype=np.float64)
     elif request.translation is not None and request.quaternion_wxyz is not None:
         pose = Pose(translation=request.translation, quaternion_wxyz=request.quaternion_wxyz).matrix("quaternion_wxyz")
+    if camera is None or pose is None:
+        camera, pose = _completed(served, camera, pose)
     tag = etag(served, request.model_dump_json())
     return _png(served, tag, camera, pose, request.mode, request.depth_range_m)
+
+
+def _completed(
+    served: ServedMap, camera: Camera | None, pose: NDArray[np.float64] | None
+) -> tuple[Camera, NDArray[np.float64]]:
+    """Return a camera and its pose; those that are missing show the whole map."""
+    if camera is None:
+        usual, at = default_view(served.overview())
+        return usual, at if pose is None else pose
+    _, at = default_view(served.overview(), width=camera.width, height=camera.height, fov_deg=_fov_deg(camera))
+    return camera, at
 
 
 def _png(
@@ -94,8 +108,9 @@ def _png(
     mode: Mode,
     depth_range: tuple[float, float] | None,
 ) -> Response:
-    view = render_view(served.in_view(camera, T_world_camera), camera, T_world_camera, mode)
-    headers = version_headers(served, tag)
+    model, pixel_error = served.in_view(camera, T_world_camera)
+    view = render_view(model, camera, T_world_camera, mode)
+    headers = version_headers(served, tag) | {"X-Pixel-Error": f"{pixel_error:.4g}"}
     if mode == "depth":
         depth_range = depth_range or depth_limits(view)
         headers["X-Depth-Range-M"] = "{:.4f} {:.4f}".format(*depth_range)

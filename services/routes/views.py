@@ -29,7 +29,7 @@ _EXAMPLES = {
         ],
     }
 }
-_ANSWER = {"map_version": 12, "views": [{"rgb": "iVBORw0KGgo...", "depth": "iVBORw0KGgo..."}]}
+_ANSWER = {"map_version": 12, "views": [{"rgb": "iVBORw0KGgo...", "depth": "iVBORw0KGgo..."}], "pixel_error": [0.0]}
 _Body = Annotated[ViewsRequest, Depends(body_of(ViewsRequest))]
 
 
@@ -43,7 +43,7 @@ def views(request: Request, served: ServedAfterFrames, settings: Settings, query
     """Render the view of each camera.
 
     JSON holds PNGs in base64. msgpack and npy hold arrays: rgb uint8, depth float32 [m] (0: nothing there), normal
-    float32, alpha float32.
+    float32, alpha float32. `pixel_error` [px] is the size of merged details in each view of a tiled map, else 0.
     """
     if len(query.views) * len(query.modes) > settings.max_views:
         hint = "split the request, or raise SPLATBOT_MAX_VIEWS"
@@ -53,10 +53,12 @@ def views(request: Request, served: ServedAfterFrames, settings: Settings, query
         raise InputError("are not one array.", field="views", hint="ask for one mode and one size, or for msgpack")
     as_arrays = NPY in accepted or MSGPACK in accepted
     drawn: list[dict[str, Any]] = []
+    errors: list[float] = []
     for number, view in enumerate(query.views):
         check_size(view.camera.width, view.camera.height, settings)
         camera, pose = Camera(**view.camera.model_dump()), view.pose.matrix(f"views.{number}.pose")
-        model = served.in_view(camera, pose)
+        model, pixel_error = served.in_view(camera, pose)
+        errors.append(pixel_error)
         images: dict[str, Any] = {}
         for mode in query.modes:
             image = render_view(model, camera, pose, mode)
@@ -65,7 +67,7 @@ def views(request: Request, served: ServedAfterFrames, settings: Settings, query
             else:
                 images[mode] = base64.b64encode(to_png(image, mode)).decode()
         drawn.append(images)
-    body: dict[str, Any] = {"map_version": served.map_version, "views": drawn}
+    body: dict[str, Any] = {"map_version": served.map_version, "views": drawn, "pixel_error": errors}
     if NPY in accepted:
         body["array"] = np.stack([images[query.modes[0]] for images in drawn])
     return answer(request, body, array="array")

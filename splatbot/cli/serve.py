@@ -160,10 +160,7 @@ def _connect_arm(runtime: Runtime, address: str) -> RosController | UrController
 
 def _add_map(runtime: Runtime, map_: Path) -> None:
     if is_tiled_map(map_):
-        from splatbot.tiles import TiledMap
-
-        tiles = TiledMap(map_, memory_mb=runtime.settings.tiles_mb)
-        runtime.store.add(MAP_ID, source=map_.name, state="static", awaited=False, tiles=tiles)
+        _add_tiles(runtime, map_)
         return
     from splatbot.gaussians import GaussianModel, Snapshot
     from splatbot.robots.graspable_objects import run_of
@@ -179,6 +176,18 @@ def _add_map(runtime: Runtime, map_: Path) -> None:
         workspace=find_workspace(path),
         run=run_of(map_),
     )
+
+
+def _add_tiles(runtime: Runtime, folder: Path) -> None:
+    from splatbot.tiles.tiled_map import TiledMap, TileMemoryError
+    from splatbot.workspace import find_workspace
+
+    try:
+        tiles = TiledMap(folder, memory_mb=runtime.settings.tiles_mb)
+    except TileMemoryError as error:
+        raise InputError(error.message, field="SPLATBOT_TILES_MB", hint=error.hint) from error
+    scene = find_workspace(folder)
+    runtime.store.add(MAP_ID, source=folder.name, state="static", awaited=False, workspace=scene, tiles=tiles)
 
 
 def _follow_camera(runtime: Runtime, device: str) -> None:

@@ -9,7 +9,7 @@ import tyro
 
 from splatbot.cli.paths import check_output
 from splatbot.errors import InputError
-from splatbot.layouts import TILES_NAME, map_file
+from splatbot.layouts import TILES_NAME, is_map, log_layout, map_file
 
 if TYPE_CHECKING:
     from splatbot.gaussians import GaussianModel
@@ -31,7 +31,7 @@ def tile(
     """Write a map as a folder of tiles, of which a program loads only those that it needs.
 
     Collision queries in a box have the answers of the whole map. Views use coarser tiles where details are below a
-    pixel. `splatbot render` and `splatbot info` take the folder.
+    pixel. `splatbot render`, `info` and `serve` take the folder. The scene.yaml next to the map is copied to it.
 
     The sweep compares the tiled map with the whole one. References are the held-out images of the run, or the whole map
     with 16 rays a pixel from 6 virtual views.
@@ -51,6 +51,9 @@ def tile(
     """
     file = map_file(map)
     check_output(out)
+    if is_map(out) or log_layout(out) or (out / "metrics.json").exists():
+        hint = "name a folder of its own"
+        raise InputError("is the folder of a run, a map or a log.", file=out, field="--out", hint=hint)
     if (out / TILES_NAME).exists() and not overwrite:
         raise InputError("exists already.", file=out, field="--out", hint="name another one, or give --overwrite")
     if memory_mb is not None and not sweep:
@@ -63,13 +66,15 @@ def tile(
     from splatbot.tiles.tiled_map import CONSTANTS
     from splatbot.tiles.writing import CONSTANTS as TILING
     from splatbot.tiles.writing import write_tiles
+    from splatbot.workspace import find_workspace
 
+    scene = find_workspace(file)
     with steps() as on_step:
         on_step("loading")
         model = load_gaussians(file)
         on_step("tiling")
         count = TILING.tile_gaussians if tile_gaussians is None else tile_gaussians
-        write_tiles(model, out, tile_gaussians=count, source=file.name)
+        write_tiles(model, out, tile_gaussians=count, source=file.name, workspace=scene)
     print_table(describe_tiles(out), title=str(out))
     if sweep and len(model):
         _sweep(model, map, out, CONSTANTS.memory_mb if memory_mb is None else memory_mb)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import stat
 from itertools import accumulate
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -15,7 +16,8 @@ from splatbot.formats.checks import MAX_GAUSSIANS
 from splatbot.layouts import TILES_NAME
 
 DATA_NAME = "tiles.bin"
-MAX_INDEX_BYTES = 256 * 2**20
+MAX_TILES = 100_000
+MAX_INDEX_BYTES = 64 * 2**20
 
 _HINT = "write the tiled map again: splatbot tile MAP --out FOLDER --overwrite"
 _Length = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
@@ -32,15 +34,15 @@ class Tile(BaseModel):
     Args:
         children: numbers of the tiles that it coarsens; none for a leaf, which has Gaussians of the map.
         count: number of Gaussians.
-        low, high: box of the means [m].
-        scale: largest standard deviation [m].
+        low, high: box of the means [m]; it encloses those of the children.
+        scale: largest standard deviation [m]; that of a child is no larger.
         error: edge of the cells in which Gaussians were merged [m], 0 for a leaf.
         sha256: digest of its bytes.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    children: tuple[Annotated[int, Field(ge=0)], ...]
+    children: tuple[Annotated[int, Field(ge=0)], ...] = Field(fail_fast=True)
     count: int = Field(ge=1, le=MAX_GAUSSIANS)
     low: _Point
     high: _Point
@@ -66,7 +68,7 @@ class TileIndex(BaseModel):
     source: str
     gaussians: int = Field(ge=0, le=MAX_GAUSSIANS)
     sh_degree: int = Field(ge=0, le=4)
-    tiles: tuple[Tile, ...]
+    tiles: tuple[Tile, ...] = Field(max_length=MAX_TILES, fail_fast=True)
 
     @property
     def sh_terms(self) -> int:
@@ -92,12 +94,16 @@ def read_index(folder: Path) -> TileIndex:
     """
     file = folder / TILES_NAME
     try:
-        if file.stat().st_size > MAX_INDEX_BYTES:
+        found = file.stat()
+        if not stat.S_ISREG(found.st_mode):
+            raise FormatError("is no file.", file=file, hint=_HINT)
+        if found.st_size > MAX_INDEX_BYTES:
             raise FormatError(f"has more than {MAX_INDEX_BYTES:,} bytes.", file=file, hint=_HINT)
         body = json.loads(file.read_bytes())
         if not isinstance(body, dict):
             raise ValueError("no object")
-        given = body.pop("sha256", None)
+        if body.pop("sha256", None) != _digest(body):
+            raise FormatError("is damaged: its checksum does not fit.", file=file, field="sha256", hint=_HINT)
         index = TileIndex.model_validate(body)
     except OSError as error:
         hint = "give a folder that `splatbot tile` wrote"
@@ -108,8 +114,6 @@ def read_index(folder: Path) -> TileIndex:
         raise FormatError(f"is damaged: {first['msg']}.", file=file, field=field, hint=_HINT) from error
     except (ValueError, RecursionError) as error:
         raise FormatError("is damaged: it is no JSON object.", file=file, hint=_HINT) from error
-    if given != _digest(body):
-        raise FormatError("is damaged: its checksum does not fit.", file=file, field="sha256", hint=_HINT)
     _check_tree(file, index)
     return index
 

@@ -5,9 +5,11 @@ from __future__ import annotations
 import hashlib
 import heapq
 import os
+import stat
 import threading
+import weakref
 from collections import OrderedDict
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -36,6 +38,8 @@ class TiledMapConstants:
         memory_mb: default of the memory of tiles, and of the largest answer.
         pixel_error: default of the largest edge of a cell of merged Gaussians in a view [px].
         slack: share by which ellipsoids grow in queries, for the rounding of a field.
+        box_slack: share of its diagonal and of its largest coordinate by which a box grows, for the same.
+        scale_slack: share by which a standard deviation may exceed the bound of its tile, for the rounding of exp.
         sigmas: standard deviations that the rasterizer draws.
         near: [m] nearest Gaussian that it draws.
         blur: [px²] that it adds to projected variances.
@@ -45,6 +49,8 @@ class TiledMapConstants:
     memory_mb: float = 24.0
     pixel_error: float = 1.0
     slack: float = 1e-4
+    box_slack: float = 4e-6
+    scale_slack: float = 1e-6
     sigmas: float = 3.34
     near: float = 0.01
     blur: float = 0.3
@@ -72,11 +78,15 @@ class TiledView:
     tiles: int
 
 
+class TileMemoryError(InputError):
+    """The tiles of a query, or the largest tile, exceed the memory."""
+
+
 class TiledMap:
     """A map in a folder that `splatbot tile` wrote; any number of threads may query it.
 
     Tiles are read when a query needs them. The latest ones stay in memory, up to ``memory_mb``. An answer of Gaussians
-    takes at most as much again.
+    takes at most as much again. The file is closed with the last reference to the map.
 
     Args:
         folder: of the tiled map.
@@ -84,7 +94,7 @@ class TiledMap:
 
     Raises:
         FormatError: the index is missing or damaged, or the data does not have its size.
-        InputError: the memory is too small for a tile.
+        TileMemoryError: the memory is too small for a tile.
     """
 
     def __init__(self, folder: str | Path, *, memory_mb: float = CONSTANTS.memory_mb) -> None:
@@ -102,17 +112,21 @@ class TiledMap:
         self._high = np.array([tile.high for tile in tiles]).reshape(-1, 3)
         self._scales = np.maximum([tile.scale for tile in tiles], SCALE_FLOOR)
         self._leaves = np.array([not tile.children for tile in tiles], np.bool_)
+        for number in np.flatnonzero(~self._leaves).tolist():  # children come first; earlier writers did not nest
+            family = [number, *tiles[number].children]
+            self._low[number], self._high[number] = self._low[family].min(axis=0), self._high[family].max(axis=0)
+            self._scales[number] = self._scales[family].max()
         if self._most < self._counts.max(initial=1):
             least = self._counts.max(initial=1) * self._bytes_each / 1e6
-            raise InputError(f"is {memory_mb:g} MB.", field="memory_mb", hint=f"give {least:.3g} or more")
+            raise TileMemoryError(f"is {memory_mb:g} MB.", field="memory_mb", hint=f"give {least:.3g} or more")
         self._file = _open(self.folder / DATA_NAME, self._starts[-1] * self._bytes_each)
+        self._close_file = weakref.finalize(self, os.close, self._file)
 
     def close(self) -> None:
         """Close the file of the tiles; later queries raise an OSError."""
         with self._lock:
             self._cache.clear()
-            if self._file >= 0:
-                os.close(self._file)
+            self._close_file()
             self._file = -1
 
     def __enter__(self) -> TiledMap:
@@ -148,10 +162,11 @@ class TiledMap:
             n_sigma: standard deviations at which the surface of a Gaussian lies.
 
         Raises:
-            InputError: the box or n_sigma is invalid, or the tiles of the box exceed the memory.
+            InputError: the box or n_sigma is invalid.
+            TileMemoryError: the tiles of the box exceed the memory.
             FormatError: a tile is damaged.
         """
-        box = checked_box(low, high)
+        box = _enlarged(checked_box(low, high))
         if not 0.0 <= n_sigma < np.inf:
             raise InputError(f"is {n_sigma}.", field="n_sigma", hint="give standard deviations, 0 or more")
         reach = n_sigma * (1.0 + CONSTANTS.slack)
@@ -160,7 +175,7 @@ class TiledMap:
         if count > self._most:
             used, limit = count * self._bytes_each / 1e6, self._most * self._bytes_each / 1e6
             hint = "give a smaller box, or more memory_mb"
-            raise InputError(f"needs {used:.3g} MB, at most {limit:.3g} MB are allowed.", field="box", hint=hint)
+            raise TileMemoryError(f"needs {used:.3g} MB, at most {limit:.3g} MB are allowed.", field="box", hint=hint)
         parts = [MapPart.empty(self.index.sh_degree)]
         for number in found.tolist():
             part = self._load(number)
@@ -268,6 +283,7 @@ class TiledMap:
                 self._cache.popitem(last=False)
             self.loads += 1
             part = decode(self._read(number), self.index.sh_terms)
+            self._check(part, number)
             self._cache[number] = part
             return part
 
@@ -280,9 +296,36 @@ class TiledMap:
             raise FormatError("is damaged: its checksum does not fit.", file=self._path, field=field, hint=hint)
         return data
 
+    def _check(self, part: MapPart, number: int) -> None:
+        """Check that Gaussians are finite, within the bounds of their tile, and of rows of the map.
+
+        Raises:
+            FormatError: they are not.
+        """
+        model = part.model
+        means, scales = model.means.numpy(), np.exp(model.log_scales.numpy().astype(np.float64))
+        rows, most = part.rows.numpy(), (1.0 + CONSTANTS.scale_slack) * self._scales[number]
+        problems = {
+            "is not finite": any(not torch.isfinite(getattr(model, column.name)).all() for column in fields(model)),
+            "has a quaternion of zeros": bool((model.quats == 0).all(dim=1).any()),
+            "leaves its box": bool(((means < self._low[number]) | (means > self._high[number])).any()),
+            "exceeds its scale": bool((scales > most).any()),
+            "has rows that the map lacks": bool(((rows < 0) | (rows >= self.index.gaussians)).any()),
+        }
+        for problem in (text for text, is_wrong in problems.items() if is_wrong):
+            hint = "write the tiled map again: splatbot tile MAP --out FOLDER --overwrite"
+            raise FormatError(f"{problem}.", file=self._path, field=f"tile {number}", hint=hint)
+
     @property
     def _path(self) -> Path:
         return self.folder / DATA_NAME
+
+
+def _enlarged(box: tuple[Array, Array]) -> tuple[Array, Array]:
+    """Return a box, enlarged for the rounding of a field to float32."""
+    low, high = box
+    room = CONSTANTS.box_slack * (np.linalg.norm(high - low) + np.abs(box).max())
+    return low - room, high + room
 
 
 def _meets(box: tuple[Array, Array], low: Array, high: Array, reach: Array) -> NDArray[np.bool_]:
@@ -295,16 +338,16 @@ def _open(path: Path, size: int) -> int:
     """Open a file of a known size.
 
     Raises:
-        FormatError: it cannot be read, or has another size.
+        FormatError: it is no file, cannot be read, or has another size.
     """
     try:
-        file = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        file = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # a pipe would wait for its writer
     except OSError as error:
         hint = "give a folder that `splatbot tile` wrote"
         raise FormatError(f"cannot be read ({error.strerror}).", file=path, hint=hint) from error
-    found = os.fstat(file).st_size
-    if found != size:
+    found = os.fstat(file)
+    if not stat.S_ISREG(found.st_mode) or found.st_size != size:
         os.close(file)
         hint = "restore it from a copy, or write the tiled map again"
-        raise FormatError(f"has {found:,} bytes, not {size:,}.", file=path, hint=hint)
+        raise FormatError(f"is no file of {size:,} bytes.", file=path, hint=hint)
     return file

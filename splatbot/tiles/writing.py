@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
 import torch
 
-from splatbot.atomic import atomic_write, replace_files, write_text
+from splatbot.atomic import atomic_write, replace_files, sweep_drafts, write_text
 from splatbot.collision.solids import MAX_VALUE
 from splatbot.errors import InputError
 from splatbot.gaussians import GaussianModel
 from splatbot.layouts import TILES_NAME
 from splatbot.protocols import Array
-from splatbot.tiles.index import DATA_NAME, Tile, TileIndex
+from splatbot.tiles.index import DATA_NAME, MAX_TILES, Tile, TileIndex
 from splatbot.tiles.merging import Ints, merged
 from splatbot.tiles.part import MapPart, encode
+from splatbot.workspace import NAME as SCENE_NAME
+from splatbot.workspace import Workspace
 
 
 @dataclass(frozen=True)
@@ -40,10 +42,16 @@ class TilingConstants:
 
 
 CONSTANTS = TilingConstants()
+_TILES_OF_FULL = 4  # at most, for each full tile of Gaussians: leaves are half full, and have as many parents
 
 
 def write_tiles(
-    model: GaussianModel, folder: str | Path, *, tile_gaussians: int = CONSTANTS.tile_gaussians, source: str = ""
+    model: GaussianModel,
+    folder: str | Path,
+    *,
+    tile_gaussians: int = CONSTANTS.tile_gaussians,
+    source: str = "",
+    workspace: Workspace | None = None,
 ) -> TileIndex:
     """Write a map as a folder of tiles, which :class:`splatbot.tiles.TiledMap` reads.
 
@@ -53,18 +61,25 @@ def write_tiles(
 
     Args:
         model: the map.
-        folder: it is created if need be; a tiled map in it is replaced.
+        folder: it is created if need be; a tiled map in it is replaced, and drafts of killed writers are removed.
         tile_gaussians: largest number of Gaussians of a leaf.
         source: name of the map, for display.
+        workspace: scene of the map, written next to the tiles. If None, the folder's own scene stays.
 
     Raises:
-        InputError: a value is not finite or beyond 1e6 m, or tile_gaussians is out of range.
+        InputError: a value is not finite or beyond 1e6 m, or tile_gaussians is out of range or small for the map.
         OSError: the folder cannot be written.
     """
     if not CONSTANTS.least <= tile_gaussians <= CONSTANTS.most:
         hint = f"give {CONSTANTS.least} to {CONSTANTS.most:,}"
         raise InputError(f"is {tile_gaussians}.", field="tile_gaussians", hint=hint)
+    least = -(-_TILES_OF_FULL * len(model) // (MAX_TILES - 1))
+    if tile_gaussians < least:
+        problem = f"is {tile_gaussians:,}, too few for a map of {len(model):,}."
+        raise InputError(problem, field="tile_gaussians", hint=f"give {least:,} or more")
+    model = GaussianModel(**{column.name: getattr(model, column.name).detach() for column in fields(model)})
     _check(model)
+    sweep_drafts(Path(folder))
     index = TileIndex(source=source, gaussians=len(model), sh_degree=model.sh_degree, tiles=())
 
     def write_data(path: Path) -> None:
@@ -77,7 +92,8 @@ def write_tiles(
     def write_index(path: Path) -> None:
         write_text(index.to_json())(path)
 
-    replace_files(folder, {DATA_NAME: write_data, TILES_NAME: write_index}, remove=[TILES_NAME])
+    scene = {} if workspace is None else {SCENE_NAME: workspace.save}
+    replace_files(folder, {**scene, DATA_NAME: write_data, TILES_NAME: write_index}, remove=[TILES_NAME])
     return index
 
 
@@ -121,13 +137,13 @@ class _TileWriter:
     def _write(self, part: MapPart, children: tuple[int, ...], error: float) -> int:
         data = encode(part)
         self.file.write(data)
-        means = part.model.means
+        means, inner = part.model.means, [self.tiles[number] for number in children]
         tile = Tile(
             children=children,
             count=len(part),
-            low=tuple(means.amin(0).tolist()),
-            high=tuple(means.amax(0).tolist()),
-            scale=float(part.model.scales.max()),
+            low=tuple(np.min([means.amin(0).tolist(), *(child.low for child in inner)], axis=0).tolist()),
+            high=tuple(np.max([means.amax(0).tolist(), *(child.high for child in inner)], axis=0).tolist()),
+            scale=max(float(part.model.scales.max()), *(child.scale for child in inner), 0.0),
             error=error,
             sha256=hashlib.sha256(data).hexdigest(),
         )
@@ -156,15 +172,15 @@ def _check(model: GaussianModel) -> None:
         InputError: the message names the row.
     """
     for name in ("means", "quats", "log_scales", "opacity_logits", "sh", "uncertainty"):
-        bad = ~torch.isfinite(getattr(model, name).detach())[:, None].flatten(1).all(dim=1)
+        bad = ~torch.isfinite(getattr(model, name))[:, None].flatten(1).all(dim=1)
         if bad.any():
             raise InputError(f"row {int(bad.nonzero()[0, 0])} is not finite.", field=name, hint="remove that Gaussian")
-    for name, lengths in (("means", model.means.detach().abs()), ("log_scales", model.scales.detach())):
+    for name, lengths in (("means", model.means.abs()), ("log_scales", model.scales)):
         far = (lengths > MAX_VALUE).any(dim=1)
         if far.any():
             hint = "give metres, or remove that Gaussian"
             raise InputError(f"row {int(far.nonzero()[0, 0])} is beyond {MAX_VALUE:g} m.", field=name, hint=hint)
-    zero = (model.quats.detach() == 0).all(dim=1)
+    zero = (model.quats == 0).all(dim=1)
     if zero.any():
         hint = "use (1, 0, 0, 0) for no rotation"
         raise InputError(f"row {int(zero.nonzero()[0, 0])} is zero.", field="quats", hint=hint)

@@ -82,6 +82,22 @@ def test_an_existing_tiled_map_is_replaced_only_with_overwrite(run: RunCommand, 
     assert sorted(path.name for path in tiled.iterdir()) == ["tiles.bin", "tiles.json"]
 
 
+@pytest.mark.parametrize("name", ["map.ply", "metrics.json", "rgb.txt", "metadata.yaml"])
+def test_the_folder_of_a_run_or_a_log_is_not_written_to(run: RunCommand, source: Path, name: str) -> None:
+    folder = source.with_name("taken")
+    folder.mkdir()
+    (folder / name).write_text("mine")
+    assert_fix_named(run("tile", source, "--out", folder, "--overwrite"), "--out")
+    assert [path.name for path in folder.iterdir()] == [name]
+
+
+def test_serve_names_the_setting_of_a_memory_that_holds_no_tile(
+    run: RunCommand, tiled: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SPLATBOT_TILES_MB", "0.001")
+    assert_fix_named(run("serve", "--map", tiled), "SPLATBOT_TILES_MB")
+
+
 def test_options_that_do_not_fit_are_refused(run: RunCommand, source: Path, tiled: Path) -> None:
     assert_fix_named(run("render", source, "--pixel-error", 1), "--pixel-error")
     assert_fix_named(run("render", source, "--memory-mb", 1), "--memory-mb")

@@ -48,7 +48,7 @@ def building(n: int, *, seed: int = 0, side: float = SIDE, degree: int = 0, size
         observations=torch.from_numpy(rng.integers(0, 9, n).astype(np.int32)),
         anchors=torch.from_numpy(rng.integers(-1, 40, n).astype(np.int32)),
         uncertainty=torch.from_numpy(rng.uniform(0.0, 0.01, n).astype(np.float32)),
-        misses=torch.from_numpy(rng.integers(-3, 3, n).astype(np.int32)),
+        misses=torch.from_numpy(rng.integers(0, 6, n).astype(np.int32)),
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -104,9 +105,9 @@ def test_an_index_that_is_no_object_is_refused(folder: Path, text: bytes) -> Non
         TiledMap(folder)
 
 
-def test_an_index_of_hundreds_of_megabytes_is_not_read(folder: Path) -> None:
+def test_an_index_of_more_than_64_mib_is_not_read(folder: Path) -> None:
     with (folder / "tiles.json").open("r+b") as file:
-        file.truncate(300 * 2**20)  # a hole in the file
+        file.truncate(64 * 2**20 + 1)  # a hole in the file
     with pytest.raises(FormatError, match="bytes"):
         TiledMap(folder)
 
@@ -135,3 +136,51 @@ def test_a_damaged_tile_is_refused_when_it_is_read_and_others_are_not(folder: Pa
         with pytest.raises(FormatError, match="tile 0"):
             tiles.near([-99, -99, -99], [99, 99, 99])
         assert len(tiles.overview()) > 0
+
+
+def test_the_checksum_of_an_index_is_checked_before_its_fields(folder: Path) -> None:
+    file = folder / "tiles.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"tiles": [{}] * 1000}))
+    with pytest.raises(FormatError) as caught:
+        TiledMap(folder)
+    assert caught.value.field == "sha256"
+
+
+def test_an_index_of_more_than_100_000_tiles_is_refused(folder: Path) -> None:
+    rewrite(folder, lambda body: body.update(tiles=[dict(body["tiles"][0], low=[0] * 3, high=[0] * 3)] * 100_001))
+    with pytest.raises(FormatError, match="100000") as caught:
+        TiledMap(folder)
+    assert caught.value.field == "tiles"
+
+
+@pytest.mark.parametrize("name", ["tiles.json", "tiles.bin"])
+def test_a_pipe_is_refused_without_waiting_for_its_writer(folder: Path, name: str) -> None:
+    (folder / name).unlink()
+    os.mkfifo(folder / name)
+    with pytest.raises(FormatError, match="is no file"):
+        TiledMap(folder)
+
+
+# Bytes of a Gaussian of degree 0 before the arrays: means 12, quaternions 16, scales 12, ..., rows 4 at the end.
+LIES: dict[str, tuple[int, str, float, str]] = {
+    "no number for a mean": (0, "<f4", np.nan, "finite"),
+    "no number for a scale": (28, "<f4", np.nan, "finite"),
+    "a mean out of the box": (0, "<f4", 50.0, "box"),
+    "a scale above that of the tile": (28, "<f4", 1.0, "scale"),
+    "a row beyond the map": (72, "<i4", 1000, "rows"),
+    "a negative row": (72, "<i4", -1, "rows"),
+}
+
+
+@pytest.mark.parametrize("name", LIES)
+def test_a_tile_that_leaves_its_bounds_is_never_free_space(folder: Path, name: str) -> None:
+    before, kind, value, word = LIES[name]
+    data = bytearray((folder / "tiles.bin").read_bytes())
+    count = json.loads((folder / "tiles.json").read_text())["tiles"][0]["count"]
+    place = count * before
+    data[place : place + 4] = np.array(value, kind).tobytes()
+    (folder / "tiles.bin").write_bytes(data)
+    rewrite(folder, set_in(0, "sha256", hashlib.sha256(data[: count * 76]).hexdigest()))
+    with TiledMap(folder) as tiles, pytest.raises(FormatError, match=word) as caught:
+        tiles.field([-99, -99, -99], [99, 99, 99])
+    assert (caught.value.file, caught.value.field) == (str(folder / "tiles.bin"), "tile 0")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -19,6 +21,7 @@ from splatbot.rasterize.views import render_view
 from splatbot.tiles import TiledMap, write_tiles
 from splatbot.tiles.part import bytes_each
 from tests.unit.tiles.maps import HEIGHT, SIDE, Array, assert_equal, boxes_of, building
+from tests.unit.tiles.test_index import rewrite
 
 N, TILE = 12_000, 500
 CAMERA = Camera(160.0, 150.0, 82.0, 55.0, 160, 120)
@@ -70,6 +73,25 @@ def test_verdicts_in_a_box_are_those_of_the_whole_map(model: GaussianModel, fold
     expected = GaussianCollisionField(model, n_sigma).in_collision(spheres)
     assert 100 < expected.sum() < len(spheres)
     assert (found == expected).all()
+
+
+def test_verdicts_at_the_border_of_a_box_far_away_are_those_of_the_whole_map(tmp_path: Path) -> None:
+    rng, place = np.random.default_rng(3), np.array([2e4, -3e4, 1e4])
+    model = GaussianModel.from_activated(
+        means=place + rng.uniform(-0.5, 0.5, (4000, 3)),
+        quats=np.tile((1.0, 0.0, 0.0, 0.0), (4000, 1)),
+        scales=np.full((4000, 3), 0.02),
+        opacities=np.full(4000, 0.9),
+        colors=np.full((4000, 3), 0.5),
+    )
+    model.observations += 1
+    write_tiles(model, tmp_path, tile_gaussians=TILE)
+    points = place + rng.uniform(-0.5, 0.5, (200, 3))
+    expected = GaussianCollisionField(model).in_collision(points)
+    with TiledMap(tmp_path) as tiles:
+        found = [bool(tiles.field(point, point).in_collision(point[None])[0]) for point in points]
+    assert 0 < expected.sum() < len(points)
+    assert found == expected.tolist()
 
 
 def test_distances_up_to_the_reach_are_those_of_the_whole_map(model: GaussianModel, folder: Path) -> None:
@@ -136,6 +158,18 @@ def test_an_exact_view_is_that_of_the_whole_map_bit_for_bit(model: GaussianModel
                 assert np.array_equal(found, expected)
             counts.append(len(view.model))
     assert min(counts) < N / 2  # tiles out of view are left out
+
+
+def test_an_exact_view_of_a_folder_whose_bounds_are_not_nested_is_that_of_the_whole_map(
+    model: GaussianModel, folder: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(folder, tmp_path / "tiles")
+    place = [9e5, 9e5, 9e5]
+    rewrite(tmp_path / "tiles", lambda body: body["tiles"][-1].update(low=place, high=place, scale=0.0))
+    with TiledMap(tmp_path / "tiles") as tiles:
+        view = tiles.in_view(CAMERA, poses()[0], pixel_error=0.0)
+    assert len(view.model) > 100
+    assert_equal(view.model, model.select(view.rows.long()))
 
 
 def test_a_far_view_has_few_gaussians_and_no_more_error_than_the_whole_map(tmp_path: Path) -> None:
@@ -220,3 +254,12 @@ def test_a_closed_map_answers_no_more(folder: Path) -> None:
     tiles.close()
     with pytest.raises(OSError, match="descriptor"):
         tiles.overview()
+
+
+def test_the_file_is_closed_with_the_last_reference_to_the_map(folder: Path) -> None:
+    tiles = TiledMap(folder)
+    descriptor = tiles._file
+    os.fstat(descriptor)
+    del tiles
+    with pytest.raises(OSError, match="descriptor"):
+        os.fstat(descriptor)

@@ -17,7 +17,8 @@ from splatbot.failpoints import VARIABLE
 from splatbot.gaussians import GaussianModel
 from splatbot.tiles import TiledMap, write_tiles
 from splatbot.tiles.index import TileIndex
-from tests.unit.tiles.maps import assert_equal, building
+from splatbot.workspace import Workspace, find_workspace
+from tests.unit.tiles.maps import COLUMNS, assert_equal, building
 
 EVERYWHERE = np.full(3, 2e6)
 
@@ -55,6 +56,44 @@ def test_each_parent_has_about_the_gaussians_of_one_child(tmp_path: Path) -> Non
     for tile in parents:
         assert tile.count <= max(index.tiles[child].count for child in tile.children)
         assert tile.error >= max(index.tiles[child].error for child in tile.children)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_bounds_and_scales_of_parents_enclose_those_of_their_children(tmp_path: Path, seed: int) -> None:
+    model = building(3000, seed=seed)
+    model.log_scales[::300] += np.log(30.0)
+    index = write_tiles(model, tmp_path, tile_gaussians=200)
+    for tile in index.tiles:
+        for child in (index.tiles[number] for number in tile.children):
+            assert (np.array(tile.low) <= child.low).all()
+            assert (np.array(tile.high) >= child.high).all()
+            assert tile.scale >= child.scale
+
+
+def test_a_model_that_is_optimized_is_written(tmp_path: Path) -> None:
+    model = building(300)
+    model.means.requires_grad_()
+    write_tiles(model, tmp_path, tile_gaussians=100)
+    with TiledMap(tmp_path) as tiles:
+        assert torch.equal(tiles.near(-EVERYWHERE, EVERYWHERE).model.means, model.means.detach())
+
+
+def test_the_scene_of_a_map_is_written_with_its_tiles(tmp_path: Path) -> None:
+    scene = Workspace(joint_offsets=np.array([0.0, 0.1]), offsets_of="arm")
+    write_tiles(building(100), tmp_path, workspace=scene)
+    found = find_workspace(tmp_path)
+    assert found is not None
+    assert found.joint_offsets is not None
+    assert found.joint_offsets.tolist() == [0.0, 0.1]
+
+
+def test_a_map_of_more_tiles_than_an_index_may_have_is_refused(tmp_path: Path) -> None:
+    model = building(1)
+    many = GaussianModel(*(getattr(model, name).expand(1_700_000, *getattr(model, name).shape[1:]) for name in COLUMNS))
+    with pytest.raises(InputError, match="69 or more") as caught:
+        write_tiles(many, tmp_path / "tiles", tile_gaussians=64)
+    assert caught.value.field == "tile_gaussians"
+    assert not (tmp_path / "tiles").exists()
 
 
 @pytest.mark.parametrize("kind", ["one place", "a lattice", "a line"])
@@ -145,7 +184,9 @@ write_tiles(building(700, seed=1), sys.argv[1], tile_gaussians=100)
 
 
 @pytest.mark.parametrize("point", ["rename:1", "rename:3"])
-def test_a_killed_process_leaves_the_earlier_map_or_none(tmp_path: Path, point: str) -> None:
+def test_a_killed_process_leaves_the_earlier_map_or_none_and_drafts_that_the_next_writer_removes(
+    tmp_path: Path, point: str
+) -> None:
     write_tiles(building(600), tmp_path, tile_gaussians=100)
     killed = subprocess.run(
         [sys.executable, "-c", WRITE, str(tmp_path)], env={**os.environ, VARIABLE: point}, check=False
@@ -156,3 +197,6 @@ def test_a_killed_process_leaves_the_earlier_map_or_none(tmp_path: Path, point: 
     else:
         with TiledMap(tmp_path) as tiles:
             assert_equal(tiles.near(-EVERYWHERE, EVERYWHERE).model, building(600))
+    assert any(tmp_path.glob(".*.draft"))
+    write_tiles(building(600), tmp_path, tile_gaussians=100)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["tiles.bin", "tiles.json"]
