@@ -1,4 +1,4 @@
-"""Estimated times of the sensor in runs: kept when a run goes on, estimated anew for another recording."""
+"""Estimated times of the sensor in runs: kept when a run goes on, estimated again for another recording."""
 
 from __future__ import annotations
 
