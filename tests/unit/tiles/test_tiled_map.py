@@ -75,23 +75,18 @@ def test_verdicts_in_a_box_are_those_of_the_whole_map(model: GaussianModel, fold
     assert (found == expected).all()
 
 
-def test_verdicts_at_the_border_of_a_box_far_away_are_those_of_the_whole_map(tmp_path: Path) -> None:
-    rng, place = np.random.default_rng(3), np.array([2e4, -3e4, 1e4])
+def test_an_ellipsoid_as_near_to_a_box_as_float32_resolves_is_loaded(tmp_path: Path) -> None:
     model = GaussianModel.from_activated(
-        means=place + rng.uniform(-0.5, 0.5, (4000, 3)),
-        quats=np.tile((1.0, 0.0, 0.0, 0.0), (4000, 1)),
-        scales=np.full((4000, 3), 0.02),
-        opacities=np.full(4000, 0.9),
-        colors=np.full((4000, 3), 0.5),
+        means=np.array([[3000.0, 0.0, 0.0], [2999.0, 0.0, 0.0]]),
+        quats=np.array([[1.0, 0.0, 0.0, 0.0]] * 2),
+        scales=np.full((2, 3), 0.01),
+        opacities=np.full(2, 0.9),
+        colors=np.full((2, 3), 0.5),
     )
-    model.observations += 1
-    write_tiles(model, tmp_path, tile_gaussians=TILE)
-    points = place + rng.uniform(-0.5, 0.5, (200, 3))
-    expected = GaussianCollisionField(model).in_collision(points)
+    write_tiles(model, tmp_path)
+    corner = np.array([3000.02 + 2.0 * float(np.spacing(np.float32(3000.0))), 0.0, 0.0])
     with TiledMap(tmp_path) as tiles:
-        found = [bool(tiles.field(point, point).in_collision(point[None])[0]) for point in points]
-    assert 0 < expected.sum() < len(points)
-    assert found == expected.tolist()
+        assert tiles.near(corner, corner + 0.1).rows.tolist() == [0]
 
 
 def test_distances_up_to_the_reach_are_those_of_the_whole_map(model: GaussianModel, folder: Path) -> None:
