@@ -141,8 +141,9 @@ class MotionFilter:
 
     def twist_at(self, stamp: float) -> Array:
         """Return the expected twist (6,) [m/s, rad/s] at a time [s] near the last pose, zero where it is unknown."""
-        known = self._state is not None and abs(stamp - self._state.stamp) <= CONSTANTS.max_gap
-        return self._state.twist if known and self._state is not None else np.zeros(6)
+        if self._state is None or abs(stamp - self._state.stamp) > CONSTANTS.max_gap:
+            return np.zeros(6)
+        return self._state.twist
 
     def update(self, state: CameraMotion) -> None:
         """Replace the state."""

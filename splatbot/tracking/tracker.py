@@ -186,16 +186,15 @@ class Tracker:
         """Align the frame again, rectified by the velocity that its pose implies, until its rows stay in place."""
         sensor = self.config.sensor
         predicted = self._filter.predict(problem.prepared.frame.stamp)
+        if predicted is None or best.verdict == "lost":
+            return best
         for _ in range(_MAX_RECTIFICATIONS):
             prepared = problem.prepared
-            if predicted is None or best.verdict == "lost":
-                break
             twist = self._measured(predicted, best, prepared).twist
             if displacement(prepared, twist, sensor) < MIN_DISPLACEMENT:
                 break
-            frame = prepared.recorded
-            again = scheduler.align_again(prepare(frame, self.config, twist), best)
-            if again.verdict == "lost" and best.verdict != "lost":  # the velocity is wrong
+            again = scheduler.align_again(prepare(prepared.recorded, self.config, twist), best)
+            if again.verdict == "lost":  # the velocity is wrong
                 problem.replace_images(prepared, best.T_world_camera)
                 break
             best = again
@@ -239,7 +238,8 @@ class Tracker:
         self._filter.update(state)
         if robot_prior is not None:
             return pose, uncertainty
-        pose = pose.with_pose(state.T_world_camera, state.covariance[:6, :6] / self.variance_scale)
+        against_keyframes = state.covariance[:6, :6] / self.variance_scale  # the uncertainty is scaled again
+        pose = pose.with_pose(state.T_world_camera, against_keyframes)
         return pose, self._uncertainty(pose)
 
     def _measured(self, predicted: CameraMotion, pose: ScoredHypothesis, prepared: PreparedFrame) -> CameraMotion:
