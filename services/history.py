@@ -22,8 +22,9 @@ from splatbot.services.problems import SaveError, disk_error
 from splatbot.services.quotas import Quotas
 from splatbot.services.scratch import Scratch
 from splatbot.services.store import MapStore, ServedMap
+from splatbot.services.version_files import read_version, save_slam
 from splatbot.services.version_index import Version
-from splatbot.services.versions import Versions, VersionsOffError, note_of_repeat, read_version, save_slam
+from splatbot.services.versions import Versions, VersionsOffError, note_of_repeat
 from splatbot.slam import Slam
 from splatbot.trajectory import Trajectory
 

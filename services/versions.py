@@ -2,31 +2,19 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
-import re
-import secrets
-import shutil
 import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-from splatbot.atomic import replace as rename
-from splatbot.atomic import sync_folder
-from splatbot.checksums import NAME as SUMS
-from splatbot.checksums import check_folder, write_sums
-from splatbot.errors import FormatError, InputError, SplatbotError
-from splatbot.run.state import Checkpoint
-from splatbot.run.state.checkpoint import FOLDER as STATE
-from splatbot.run.state.checkpoint import LogPlace
-from splatbot.services.library import read_map, write_map
+from splatbot.errors import InputError, SplatbotError
 from splatbot.services.problems import disk_error
 from splatbot.services.store import ServedMap
+from splatbot.services.version_files import SavedFiles, VersionFiles
 from splatbot.services.version_index import Version, VersionIndex
 from splatbot.slam import Slam
 
@@ -34,10 +22,6 @@ _log = logging.getLogger(__name__)
 
 FOLDER = ".versions"
 """Name in the data folder; no map has a name with a dot."""
-_MAP = "map"  # next to the folder `state` of the mapper
-_FILES = re.compile(r"[0-9a-f]{16}")
-_DRAFT = ".draft"
-_UNNAMED = ".unnamed"
 
 
 def _any_size(_size: int) -> None:
@@ -68,10 +52,6 @@ class VersionsOffError(InputError):
     http_status = 409
 
 
-class DamagedVersionError(SplatbotError):
-    """Files of a version are missing or altered."""
-
-
 class Versions:
     """Versions of all maps: immutable files below ``files``, and the index ``index.sqlite``.
 
@@ -93,16 +73,14 @@ class Versions:
     def __init__(
         self, folder: Path, *, most: int, most_bytes: int, served: Callable[[str], ServedMap | None] = lambda _: None
     ) -> None:
-        self.files = folder / "files"
         self._most, self._most_bytes = most, most_bytes
         self._served = served
         self._lock = threading.RLock()  # of the index with the pins: a version that is pinned stays
         self._pins: Counter[str] = Counter()  # of folders
         try:
-            self.files.mkdir(parents=True, exist_ok=True)
-            is_new = not any(_FILES.fullmatch(path.name) for path in self.files.iterdir())
-            self._index = VersionIndex(folder / "index.sqlite", create=is_new)
-            self._sweep()
+            self.files = VersionFiles(folder / "files")
+            self._index = VersionIndex(folder / "index.sqlite", create=self.files.is_empty)
+            self.files.sweep({version.folder for version in self._index.every()})
         except OSError as error:
             raise disk_error(error) from error
         self._count_bytes()
@@ -158,50 +136,32 @@ class Versions:
             VersionsFullError: there is no room, because the other versions have labels or are in use.
             SaveError: it cannot be written.
         """
-        snapshot = served.ready
-        known = self.in_use(served) if slam is None else None
+        created, gaussians = time.time(), len(served.ready.model)
         earlier = [v for v in self.of_map(served.id) if v.world == served.world and v.map_version <= served.map_version]
+        parent = restored_from or (earlier[-1] if earlier else None)
+        known = self.in_use(served) if slam is None else None
+        files = self.files.write(served, slam) if known is None else SavedFiles.of(known)
         version = Version(
             map=served.id,
             number=0,
-            created=time.time(),
+            created=created,
             label=label,
             note=note,
             owner=owner,
             world=served.world,
             map_version=served.map_version,
-            gaussians=len(snapshot.model),
-            keyframes=0,
-            bytes=0,
-            checksum="",
-            folder="",
-            parent=earlier[-1].number if earlier else None,
-            restored_from=None,
+            gaussians=gaussians,
+            keyframes=files.keyframes,
+            bytes=files.bytes,
+            checksum=files.checksum,
+            folder=files.folder,
+            parent=None if parent is None else parent.number,
+            restored_from=None if restored_from is None else restored_from.number,
         )
-        if restored_from is not None:
-            version = replace(version, parent=restored_from.number, restored_from=restored_from.number)
-        if known is not None:
-            shared = {name: getattr(known, name) for name in ("keyframes", "bytes", "checksum", "folder")}
-            return self._add(replace(version, **shared), check)
-        name = secrets.token_hex(8)
-        draft = self.files / f"{name}{_DRAFT}"
-        try:
-            (draft / _MAP).mkdir(parents=True)
-            write_map(served, snapshot, draft / _MAP)
-            if slam is not None:
-                save_slam(slam, draft, served.source)
-                version = replace(version, keyframes=len(slam.keyframes))  # none is on its way after the save
-            version = replace(version, bytes=_size_of(draft), checksum=_checksum(draft), folder=name)
-            sync_folder(draft)
-            rename(draft, self.files / name)
-        except OSError as error:
-            raise disk_error(error) from error
-        finally:
-            shutil.rmtree(draft, ignore_errors=True)
         try:
             return self._add(version, check)
         except SplatbotError:
-            self._remove_files(name)
+            self._remove_files(files.folder)
             raise
 
     def repeat(
@@ -278,8 +238,7 @@ class Versions:
                 raise VersionNotFoundError(f"version {version.number} was deleted.", field="version")
             self._pins[version.folder] += 1
         try:
-            _check(version, self.files / version.folder)
-            yield self.files / version.folder
+            yield self.files.checked(version)
         finally:
             with self._lock:
                 self._pins[version.folder] -= 1
@@ -337,10 +296,7 @@ class Versions:
     def _remove_files(self, name: str) -> None:
         """Remove files that no version names any more, and no request reads."""
         if not self._pins[name] and all(version.folder != name for version in self._index.every()):
-            draft = self.files / f"{name}{_DRAFT}"  # a kill during the removal leaves a draft, which a start removes
-            with suppress(OSError):
-                (self.files / name).rename(draft)
-            shutil.rmtree(draft, ignore_errors=True)
+            self.files.remove(name)
 
     def _count_bytes(self) -> None:
         """Count the bytes of each client after a change."""
@@ -348,80 +304,18 @@ class Versions:
         every = self._index.every()
         self._bytes = Counter({o: _total([v for v in every if v.owner == o]) for o in {v.owner for v in every}})
 
-    def _sweep(self) -> None:
-        """Remove the drafts of a killed process, and set whole folders aside that no version names."""
-        named = {version.folder for version in self._index.every()}
-        for path in self.files.iterdir():
-            if path.name.endswith(_DRAFT):
-                shutil.rmtree(path, ignore_errors=True)
-            elif path.name not in named and _FILES.fullmatch(path.name):
-                _log.error("%s is named by no version and set aside", path)
-                rename(path, path.with_name(f"{path.name}{_UNNAMED}"))
-
 
 def note_of_repeat(version: Version) -> str:
     """Return the note of a version that records the return to another one."""
     return f"version {version.number} again"
 
 
-def read_version(version: Version, folder: Path) -> dict[str, Any]:
-    """Read the map of a version from its checked files, as arguments of :meth:`MapStore.add`.
-
-    Raises:
-        DamagedVersionError: a file is damaged.
-    """
-    try:
-        return read_map(folder / _MAP)
-    except InputError as error:
-        raise _damaged(version, error) from error
-
-
-def save_slam(slam: Slam, folder: Path, source: str) -> None:
-    """Save the state of a mapper between two frames into ``folder/state``, with checksums."""
-    frames = len(slam.results)
-    Checkpoint(folder, 0.0).save(slam, {}, LogPlace(source, "", frames, None, frames), slam.config)
-    write_sums(folder / STATE, [path.name for path in (folder / STATE).iterdir()])
-
-
-def _check(version: Version, folder: Path) -> None:
-    """Check all files of a version.
-
-    Raises:
-        DamagedVersionError: one is missing or altered.
-    """
-    try:
-        if _checksum(folder) != version.checksum:
-            raise FormatError("is damaged: its checksum is not that of the index.", file=folder)
-        for part in sorted(folder.iterdir()):
-            check_folder(part)
-    except (InputError, OSError) as error:
-        raise _damaged(version, error) from error
-
-
 def _full(why: str, setting: str) -> VersionsFullError:
     return VersionsFullError(why, field="versions", hint=f"delete a version, or raise {setting}")
 
 
-def _damaged(version: Version, error: Exception) -> DamagedVersionError:
-    _log.error("version %d of map %s is damaged: %s", version.number, version.map, error)
-    hint = "delete it, and use another version; the service's log names the file"
-    return DamagedVersionError(f"version {version.number} of map {version.map!r} is damaged.", hint=hint)
-
-
 def _holds(version: Version, served: ServedMap) -> bool:
     return (version.world, version.map_version) == (served.world, served.map_version)
-
-
-def _checksum(folder: Path) -> str:
-    """Return the SHA-256 of the lists of checksums of a version's folders."""
-    digest = hashlib.sha256()
-    for part in sorted(path.name for path in folder.iterdir()):
-        digest.update(f"{part}\n".encode() + (folder / part / SUMS).read_bytes())
-    return digest.hexdigest()
-
-
-def _size_of(folder: Path) -> int:
-    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
 
 
 def _total(versions: list[Version]) -> int:

@@ -13,7 +13,7 @@ from splatbot.services.dependencies import Caller, IdempotencyKey, Served, Servi
 from splatbot.services.library import check_id
 from splatbot.services.merging import compare_maps, find_states, merge_maps
 from splatbot.services.routes.jobs import accepted, starts
-from splatbot.services.schemas import DiffRequest, MergeRequest
+from splatbot.services.version_schemas import DiffRequest, MergeRequest
 
 router = APIRouter(prefix="/v1/maps", tags=["versions"])
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from fastapi import APIRouter
+from pydantic import BaseModel, Field
 
 from splatbot.services.dependencies import Caller, Service, example
-from splatbot.services.schemas import QuotaInfo, Share
 
 router = APIRouter(prefix="/v1/quota", tags=["maps"])
 
@@ -16,6 +16,23 @@ _EXAMPLE = {
     "jobs": {"used": 0, "most": 16},
     "bytes": {"used": 6171264, "most": 17179869184},
 }
+
+
+class Share(BaseModel):
+    """Used and largest number."""
+
+    used: int = Field(description="present number")
+    most: int = Field(description="largest number")
+
+
+class QuotaInfo(BaseModel):
+    """Quota of the caller."""
+
+    client: str = Field(description="begin of the hash of its key, or its address")
+    requests_per_s: float = Field(description="requests per second in the long run; more are answered 429")
+    maps: Share = Field(description="maps that it made; more are answered 403")
+    jobs: Share = Field(description="jobs that wait or run; more are answered 429")
+    bytes: Share = Field(description="Gaussians of its maps, and its versions on disk; more are answered 403")
 
 
 @router.get("", responses=example(_EXAMPLE))

@@ -9,9 +9,9 @@ from fastapi import APIRouter, Depends, Path, Response
 
 from splatbot.services.codecs import JSON, body_of, request_body
 from splatbot.services.dependencies import Caller, Served, Service, example, problems
-from splatbot.services.schemas import VersionInfo, VersionList, VersionRequest
 from splatbot.services.store import ServedMap
 from splatbot.services.version_index import Version
+from splatbot.services.version_schemas import VersionInfo, VersionList, VersionNumber, VersionRequest
 from splatbot.services.versions import Versions
 
 router = APIRouter(prefix="/v1/maps", tags=["versions"])
@@ -39,7 +39,7 @@ _SAVED: dict[int | str, dict[str, Any]] = {
         "content": {JSON: {"example": _EXAMPLE}},
     }
 }
-_Number = Annotated[int, Path(ge=1, le=2**31 - 1, description="as GET .../versions lists it", examples=[1])]
+_Number = Annotated[VersionNumber, Path(description="as GET .../versions lists it", examples=[1])]
 
 
 @router.post(

@@ -22,7 +22,7 @@ from splatbot.geometry import inverse, se3_exp
 from splatbot.logs import open_log
 from splatbot.services.keys import hash_key, new_key
 from splatbot.services.settings import ServiceSettings
-from splatbot.services.versions import read_version
+from splatbot.services.version_files import read_version
 from splatbot.slam import Slam
 from splatbot.trajectory import Trajectory
 from tests.contracts.conftest import Service, running, wall, wall_store

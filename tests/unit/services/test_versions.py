@@ -21,16 +21,9 @@ from splatbot.errors import FormatError
 from splatbot.gaussians import Snapshot
 from splatbot.services.problems import SaveError
 from splatbot.services.store import MapStore, QuotaError, ServedMap
+from splatbot.services.version_files import DamagedVersionError, read_version
 from splatbot.services.version_index import Version, VersionIndex
-from splatbot.services.versions import (
-    FOLDER,
-    DamagedVersionError,
-    VersionInUseError,
-    VersionNotFoundError,
-    Versions,
-    VersionsFullError,
-    read_version,
-)
+from splatbot.services.versions import FOLDER, VersionInUseError, VersionNotFoundError, Versions, VersionsFullError
 from splatbot.trajectory import Trajectory
 from splatbot.workspace import Workspace
 from tests.models import uniform_model
@@ -398,7 +391,7 @@ def test_a_refused_save_deletes_nothing(tmp_path: Path) -> None:
         for found in kept.versions.of_map("desk"):
             with kept.versions.pinned(found):
                 pass
-        assert len(list(kept.versions.files.iterdir())) == len(numbers)
+        assert len(list(kept.versions.files.folder.iterdir())) == len(numbers)
 
 
 def test_a_version_whose_files_a_labelled_one_shares_makes_no_room_for_bytes(tmp_path: Path) -> None:
