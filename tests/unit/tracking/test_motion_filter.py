@@ -51,6 +51,19 @@ def test_exact_poses_are_kept_at_any_motion() -> None:
         assert np.abs(se3_log(inverse(state.T_world_camera) @ T)).max() < 2e-5
 
 
+def test_a_jerk_displaces_a_pose_of_8_mm_by_10_mm_and_a_pose_of_half_a_millimetre_by_less_than_its_noise() -> None:
+    """5 m/s² for 0.1 s at 30 Hz, from rest, without noise: docs/guide/tracking.md states the displacement."""
+    times = np.arange(30) / 30
+    pushed = np.clip(times - 0.5, 0, 0.1)
+    x = 2.5 * pushed**2 + 5 * 0.1 * np.maximum(times - 0.6, 0)
+    lags = {}
+    for sigma in (0.0005, 0.008):
+        states = filtered(times, [se3_exp([d, 0, 0, 0, 0, 0]) for d in x], sigma**2 * np.eye(6))
+        lags[sigma] = max(abs(s.T_world_camera[0, 3] - d) for s, d in zip(states, x, strict=True))
+    assert lags[0.0005] < 0.0005
+    assert 0.008 < lags[0.008] < 0.0105
+
+
 def test_noise_beyond_the_acceleration_of_a_hand_is_removed_and_the_covariance_is_honest() -> None:
     """A camera that turns at 60°/s with 8 mm and 0.3° of noise at 30 Hz: two thirds of the noise are left at most."""
     rng, n = np.random.default_rng(2), 300
