@@ -59,8 +59,8 @@ CONSTANTS = MapPickConstants()
 _FINE = {"objects": False, "ellipsoids": 4000}  # primitives and coarse ellipsoids reach millimetres beyond the map
 
 TARGET = "target"
-_COLOR = (0.95, 0.5, 0.1)  # which few objects have
 """Name of the target in the twin."""
+_COLOR = (0.95, 0.5, 0.1)  # of the target in pictures
 
 
 @dataclass(frozen=True, eq=False)

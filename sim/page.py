@@ -29,8 +29,9 @@ class TwinPageConstants:
         crop_radius: [m] radius of the map around the robot that is shown.
         floor: [m] half-extent of planes.
         point_size: [m] size of a point.
-        yaw: [rad] direction of the view around the z axis; at 4.9 the arm reaches to the right.
         distance: distance of the camera, relative to the extent of the motion.
+        min_distance: [m] least distance of the camera.
+        yaw: [rad] direction of the view around the z axis; at 4.9 the arm reaches to the right.
     """
 
     max_points: int = 20_000
@@ -40,6 +41,7 @@ class TwinPageConstants:
     floor: float = 0.8
     point_size: float = 0.006
     distance: float = 1.5
+    min_distance: float = 1.2
     yaw: float = 4.9
 
 
@@ -52,20 +54,19 @@ def twin_html(recording: TwinRecording, result: TwinResult) -> str:
     return recording_html(recording, title=result.scene, facts=_facts(result))
 
 
-def recording_html(recording: TwinRecording, *, title: str, facts: str) -> str:
+def recording_html(recording: TwinRecording, *, title: str, facts: str, target: str = "") -> str:
     """Return the page: robot, objects and map as points, contacts, and a curve of the arm's clearance over time.
 
     Args:
         recording: of the run.
         title: of the page.
         facts: results of the run, one line.
+        target: name of the object that is the completed surface of a target in a map, or "".
     """
     world = recording.world
     own, normals, tints, body, points, colors = _clouds(world)
     path = _tool_path(recording)
-    shown_bodies = world.model.geom_bodyid[world.of_robot] if world.of_robot.any() else body.astype(np.int64)
-    moving = np.concatenate([path, recording.poses[:, np.unique(shown_bodies), :, 3].reshape(-1, 3), np.zeros((1, 3))])
-    low, high = moving.min(axis=0), moving.max(axis=0)
+    low, high = _extent(recording, path, body)
     shown, shades = _map_points(world)
     document = {
         "points": packed(np.concatenate([shown, points]), np.float32),
@@ -84,26 +85,37 @@ def recording_html(recording: TwinRecording, *, title: str, facts: str) -> str:
         "far": FAR,
         "times": np.round(recording.times, 4).tolist(),
         "middle": ((low + high) / 2).round(3).tolist(),
-        "distance": round(max(1.2, CONSTANTS.distance * float(np.linalg.norm(high - low))), 3),
+        "distance": round(max(CONSTANTS.min_distance, CONSTANTS.distance * float(np.linalg.norm(high - low))), 3),
         "yaw": CONSTANTS.yaw,
         "size": CONSTANTS.point_size,
     }
-    return moving_page(title, facts, document, "twin_view.js", legend=_legend(world), curve=True)
+    return moving_page(title, facts, document, "twin_view.js", legend=_legend(world, target), curve=True)
 
 
-def _legend(world: World) -> list[tuple[str, str]]:
+def _legend(world: World, target: str) -> list[tuple[str, str]]:
     """Return the name and the CSS colour of each part that the page draws."""
-    objects = [obj for obj in world.scene.objects if obj.movable or obj.path]
     rows = [] if world.parts is None else [MAP_IN_COLORS]
     if world.robot is not None:
-        rows += [("arm and hand: their collision shapes, larger than the real ones", css(_ROBOT)),
-                 ("path of the tool", css(_PATH))]  # fmt: skip
-    rows += [(obj.name if obj.name != "target" else "target: its completed surface", css(obj.color)) for obj in objects]
-    return [
-        *rows,
-        ("contact of the arm; in the curve its time", css(_CONTACT)),
-        ("clearance of the arm", "var(--curve)"),
-    ]
+        rows.append(("arm and hand: their collision shapes, larger than the real ones", css(_ROBOT)))
+        rows.append(("path of the tool", css(_PATH)))
+    for obj in world.scene.objects:
+        if obj.movable or obj.path:
+            rows.append((f"{obj.name}: its completed surface" if obj.name == target else obj.name, css(obj.color)))
+    rows.append(("contact of the arm; in the curve its time", css(_CONTACT)))
+    rows.append(("clearance of the arm", "var(--curve)"))
+    return rows
+
+
+def _extent(recording: TwinRecording, path: Array, body: np.ndarray) -> tuple[Array, Array]:
+    """Return the lowest and highest coordinates (3,) [m] of the base, of the tool's path and of the robot's bodies.
+
+    Without a robot, the moving bodies ``body`` (P,) count.
+    """
+    of_robot = recording.world.of_robot
+    bodies = recording.world.model.geom_bodyid[of_robot] if of_robot.any() else body.astype(np.int64)
+    places = recording.poses[:, np.unique(bodies), :, 3].reshape(-1, 3)
+    moving = np.concatenate([path, places, np.zeros((1, 3))])
+    return moving.min(axis=0), moving.max(axis=0)
 
 
 def _tool_path(recording: TwinRecording) -> Array:

@@ -171,12 +171,13 @@ def _check_options(words: Sequence[str]) -> None:
     import importlib
 
     from splatbot.cli import COMMANDS
+    from splatbot.cli.help import parsed
 
     name, *rest = words
     command = COMMANDS[name]
     function = getattr(importlib.import_module(command.module), command.function)
     parse = functools.wraps(function)(lambda *_, **__: None)
-    tyro.cli(parse, prog=f"splatbot {name}", args=[*rest, "--out", "DIR"], config=(tyro.conf.FlagCreatePairsOff,))
+    parsed(parse, f"splatbot {name}", [*rest, "--out", "DIR"])
 
 
 def _settings(environment: Mapping[str, str]) -> dict[str, str]:

@@ -78,7 +78,7 @@ def plan_pick(
     from splatbot.grasping.pick_types import PickOptions
     from splatbot.robots.joint_offsets import robot_in_scene
     from splatbot.robots.store import load_robot
-    from splatbot.sim.map_pick import pick_on_map, twin_of_pick
+    from splatbot.sim.map_pick import TARGET, pick_on_map, twin_of_pick
     from splatbot.sim.page import recording_html
     from splatbot.workspace import find_workspace
 
@@ -112,7 +112,8 @@ def plan_pick(
     for name, motion in zip(_names(picked), picked.result.motions, strict=True):
         texts[name] = motion.trajectory.to_json()
     title = f"{known.target.label} in {map.resolve().name}"
-    texts["pick.html"] = recording_html(picked.recording, title=title, facts=f"in simulation: {_verdict(picked)}")
+    facts = f"in simulation: {_verdict(picked)}"
+    texts["pick.html"] = recording_html(picked.recording, title=title, facts=facts, target=TARGET)
     replace_files(folder, {name: write_text(text) for name, text in texts.items()})
     for path in folder.glob("[0-9]-*.json"):
         if path.name not in texts:  # a motion of an earlier pick must not follow these
