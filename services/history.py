@@ -96,7 +96,7 @@ class MapHistory:
             BusyError: the mapper works on one frame for too long.
             SaveError: the disk is full or gone.
         """
-        self.versions.in_use(served)
+        _ = self.versions  # raises if the service keeps none
         if served.state == "static":
             raise InputError(
                 f"map {served.id!r} is a file and keeps no versions.", field="map_id", hint="copy the file"
@@ -154,7 +154,7 @@ class MapHistory:
                 map_version = 1 + now.map_version
                 snapshot = Snapshot(saved["snapshot"].model, map_version, saved["snapshot"].stamp)
                 path = saved["trajectory"]
-                if path is None and now.trajectory is not None:
+                if path is None and now.trajectory is not None:  # without one, the store keeps the present one
                     path = Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
                 if mapping is not None and slam is not None:
                     undo.callback(slam.close)

@@ -161,7 +161,7 @@ class Jobs:
             if self._closed or waiting >= self._capacity:
                 why = "the service is stopping" if self._closed else f"{waiting} jobs wait"
                 raise BusyError(f"{why}.", hint="try again later")
-            own = self._count(client)
+            own = self.count(client)
             if client and self._client_capacity is not None and own >= self._client_capacity:
                 hint = "wait for one of them, cancel one, or raise SPLATBOT_MAX_CLIENT_JOBS"
                 raise TooManyJobsError(f"{own} jobs of this client wait or run.", hint=hint)
@@ -208,7 +208,7 @@ class Jobs:
     def count(self, client: str) -> int:
         """Return the number of jobs of a client that wait or run."""
         with self._lock:
-            return self._count(client)
+            return sum(job.client == client and job.state not in ENDED for job in self._jobs.values())
 
     def cancel(self, job_id: str) -> Job:
         """Request the end of a job. A waiting job ends now, a running one at its next progress report.
@@ -297,9 +297,6 @@ class Jobs:
 
     def _publish(self, job: Job) -> None:
         self._bus.publish(job_topic(job.id), job)
-
-    def _count(self, client: str) -> int:
-        return sum(job.client == client and job.state not in ENDED for job in self._jobs.values())
 
     def _known(self, key: str | None, request: str) -> Job | None:
         if key is None or key not in self._keys:

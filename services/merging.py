@@ -75,8 +75,7 @@ def find_states(
             hint = "choose a version whose `keyframes` is not 0"
             why = f"version {state.version.number} of map {state.served.id!r} has no keyframes."
             raise NoKeyframesError(why, field="version", hint=hint)
-    gaussians, keyframes = (sum(getattr(state, name) for state in states) for name in ("gaussians", "keyframes"))
-    _check_size(runtime.settings, gaussians, keyframes)
+    _check_size(runtime.settings, sum(s.gaussians for s in states), sum(s.keyframes for s in states))
     return states[0], states[1]
 
 
@@ -132,14 +131,8 @@ def _merge(runtime: Runtime, made: ServedMap, a: StateOfMap, b: StateOfMap, hand
         version = _publish(runtime, made, slam)
     finally:
         slam.close()
-    figures = merge_figures(alignment, joined, offset)
-    return {
-        **_names(a, b),
-        "made": made.id,
-        "made_version": version,
-        "gaussians": len(slam.snapshot().model),
-        **figures,
-    }
+    outcome = {"made": made.id, "made_version": version, "gaussians": len(slam.snapshot().model)}
+    return {**_names(a, b), **outcome, **merge_figures(alignment, joined, offset)}
 
 
 def _load(runtime: Runtime, a: StateOfMap, b: StateOfMap, handle: JobHandle) -> tuple[SavedRun, SavedRun]:

@@ -388,7 +388,7 @@ class Runtime:
         self._end(served.generation, "the map was deleted", timeout)
 
     def withdraw(self, served: ServedMap) -> None:
-        """Remove a map whose making has failed; the job that makes it calls this."""
+        """Remove a map whose making failed or never began; its job, which may call this, is not awaited."""
         with self._lock:
             self._jobs_of.pop(served.generation, None)
         with suppress(MapNotFoundError):  # deleted meanwhile

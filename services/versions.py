@@ -70,9 +70,7 @@ class Versions:
         SaveError: the folder cannot be written to.
     """
 
-    def __init__(
-        self, folder: Path, *, most: int, most_bytes: int, served: Callable[[str], ServedMap | None] = lambda _: None
-    ) -> None:
+    def __init__(self, folder: Path, *, most: int, most_bytes: int, served: Callable[[str], ServedMap | None]) -> None:
         self._most, self._most_bytes = most, most_bytes
         self._served = served
         self._lock = threading.RLock()  # of the index with the pins: a version that is pinned stays
@@ -83,7 +81,7 @@ class Versions:
             self.files.sweep({version.folder for version in self._index.every()})
         except OSError as error:
             raise disk_error(error) from error
-        self._count_bytes()
+        self._index.keep_reserve()
 
     def of_map(self, map_id: str) -> list[Version]:
         """Return the versions of a map by number."""
@@ -107,7 +105,7 @@ class Versions:
 
     def bytes_of(self, owner: str) -> int:
         """Return the size of the versions of a client [bytes]."""
-        return self._bytes[owner]
+        return _total([version for version in self._index.every() if version.owner == owner])
 
     def save(
         self,
@@ -207,7 +205,7 @@ class Versions:
                 raise VersionInUseError(f"the map answers from version {version.number}.", field="version", hint=hint)
             self._index.remove(version)
             self._remove_files(version.folder)
-            self._count_bytes()
+            self._index.keep_reserve()
 
     def remove_map(self, map_id: str) -> None:
         """Remove all versions of a map; files that a request reads go when it ends.
@@ -220,7 +218,7 @@ class Versions:
             self._index.remove_map(map_id)
             for version in gone:
                 self._remove_files(version.folder)
-            self._count_bytes()
+            self._index.keep_reserve()
 
     @contextmanager
     def pinned(self, version: Version) -> Iterator[Path]:
@@ -256,7 +254,7 @@ class Versions:
             for other in gone:
                 _log.info("version %d of map %s makes room", other.number, other.map)
                 self._remove_files(other.folder)
-            self._count_bytes()
+            self._index.keep_reserve()
         return version
 
     def _making_room(self, version: Version) -> list[Version]:
@@ -297,12 +295,6 @@ class Versions:
         """Remove files that no version names any more, and no request reads."""
         if not self._pins[name] and all(version.folder != name for version in self._index.every()):
             self.files.remove(name)
-
-    def _count_bytes(self) -> None:
-        """Count the bytes of each client after a change."""
-        self._index.keep_reserve()
-        every = self._index.every()
-        self._bytes = Counter({o: _total([v for v in every if v.owner == o]) for o in {v.owner for v in every}})
 
 
 def note_of_repeat(version: Version) -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Mapping
-from contextlib import suppress
 from functools import partial
 from pathlib import Path as FilePath
 from typing import Annotated, Any
@@ -17,7 +16,7 @@ from starlette.exceptions import HTTPException
 from starlette.responses import FileResponse
 
 from splatbot.config import Config, with_cameras
-from splatbot.errors import InputError, MapNotFoundError
+from splatbot.errors import InputError
 from splatbot.formats import WRITTEN, save_gaussians
 from splatbot.logs import Log, open_log
 from splatbot.protocols import Array
@@ -42,7 +41,7 @@ from splatbot.services.problems import MapNotReadyError, TooLargeError
 from splatbot.services.recordings import allowed_log
 from splatbot.services.robot_mask import RobotMask
 from splatbot.services.routes.jobs import accepted, starts
-from splatbot.services.schemas import Bounds, FurtherCameraInfo, MapInfo, MapList, MapRequest, RobotMaskInfo
+from splatbot.services.schemas import Bounds, FurtherCameraInfo, MapInfo, MapList, MapRequest, RobotMaskInfo, Vector3
 from splatbot.services.scratch import Scratch
 from splatbot.services.store import ServedMap
 from splatbot.workspace import Workspace, find_workspace
@@ -104,7 +103,6 @@ _CREATE = {
     },
 }
 _FILE: dict[int | str, dict[str, Any]] = {200: {"content": {"application/octet-stream": {}}, "description": "the file"}}
-_Corner = tuple[float, float, float]
 _FormatName = Annotated[str, Path(description=f"one of {', '.join(WRITTEN)}", examples=["ply"])]
 
 
@@ -288,8 +286,7 @@ async def _receive(request: Request, path: FilePath, most: int) -> str:
 
 def _forget(service: Service, served: ServedMap, scratch: Scratch | None = None) -> None:
     """Leave nothing of a map whose making never began."""
-    with suppress(MapNotFoundError):
-        service.remove(served)
+    service.withdraw(served)
     if scratch is not None:
         scratch.discard()
 
@@ -313,14 +310,11 @@ def _info(served: ServedMap) -> MapInfo:
     )
 
 
-def _box(served: ServedMap) -> tuple[_Corner, _Corner] | None:
+def _box(served: ServedMap) -> tuple[Vector3, Vector3] | None:
     """Return the corners of the box of all means [m]. If None, there are no Gaussians."""
     if not served.gaussians:
         return None
-    if served.tiles is not None:
-        low, high = served.tiles.box
-    else:
-        low, high = served.ready.model.means.numpy().min(axis=0), served.ready.model.means.numpy().max(axis=0)
+    low, high = served.ready.model.means.aminmax(dim=0) if served.tiles is None else served.tiles.box
     return tuple(low.tolist()), tuple(high.tolist())
 
 
