@@ -50,16 +50,14 @@ def collect_photographs(source: Path, folder: Path, frames: int | None, report: 
     if not source.is_dir():
         return _frames_of_video(source, folder, frames or USUAL_FRAMES, report)
     files = sorted(_images(source))
-    _check_count(source, min(len(files), frames or len(files)), "images")
-    if frames is not None and frames < len(files):
-        report_read = _reporter(report, "reading images", len(files))
-        images = (_read(file) for file in files)
-        files = [files[index] for index, _ in _sharpest(images, len(files), frames, report_read)]
-    for index, file in enumerate(files):
-        report("copying images", index / len(files))
-        _read(file)  # refuses damaged images before COLMAP runs
-        shutil.copyfile(file, folder / file.name)
-    return [file.name for file in files]
+    count = min(len(files), frames or len(files))
+    _check_count(source, count, "images")
+    names = []
+    images = (_read(file) for file in files)  # refuses damaged images before COLMAP runs
+    for index, _ in _sharpest(images, len(files), count, _reporter(report, "reading images", len(files))):
+        names.append(files[index].name)
+        shutil.copyfile(files[index], folder / names[-1])
+    return names
 
 
 def _images(folder: Path) -> list[Path]:
