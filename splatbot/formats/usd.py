@@ -173,10 +173,10 @@ def _read_prims(path: str | Path) -> tuple[dict[str, Any], list[dict[str, NDArra
         except subprocess.TimeoutExpired as error:
             raise damaged(path, "prims", f"OpenUSD does not read it in {error.timeout:.0f} s") from error
         if done.returncode:
-            raise damaged(path, "prims", _reason(done))
+            raise damaged(path, "prims", _reason(done).replace(str(link), Path(path).name))
         with np.load(target) as content:
             facts: dict[str, Any] = json.loads(str(content["facts"]))
-            arrays: list[dict[str, NDArray[Any]]] = [{} for _ in facts.get("prims", ())]
+            arrays: list[dict[str, NDArray[Any]]] = [{} for _ in facts["prims"]]
             for key in content.files:
                 index, _, name = key.partition(" ")
                 if name:

@@ -26,15 +26,15 @@ def main(source: str, target: str, memory: str) -> None:
     is JSON: `others` are the files that the layer needs, in which case nothing else is read.
     """
     resource.setrlimit(resource.RLIMIT_DATA, (int(memory), int(memory)))
-    from pxr import Sdf, Usd, UsdGeom
+    from pxr import Usd, UsdGeom
 
-    layer = Sdf.Layer.FindOrOpen(source)
+    layer = _open(source)
     others = [name for name in layer.GetCompositionAssetDependencies() if name]  # the layer itself has no name
-    facts: dict[str, Any] = {"others": others}
+    facts: dict[str, Any] = {"others": others, "prims": []}
     content: dict[str, Any] = {}
-    if not facts["others"]:
+    if not others:
         stage = Usd.Stage.Open(layer)
-        facts |= {"unit": UsdGeom.GetStageMetersPerUnit(stage), "up": UsdGeom.GetStageUpAxis(stage), "prims": []}
+        facts |= {"unit": UsdGeom.GetStageMetersPerUnit(stage), "up": UsdGeom.GetStageUpAxis(stage)}
         poses = UsdGeom.XformCache(Usd.TimeCode.EarliestTime())
         prims = stage.Traverse(Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate))
         for index, prim in enumerate(prim for prim in prims if _holds_gaussians(prim) and _is_visible(prim)):
@@ -42,6 +42,19 @@ def main(source: str, target: str, memory: str) -> None:
             pose = np.array(poses.GetLocalToWorldTransform(prim)).T  # OpenUSD multiplies rows from the left
             content |= {f"{index} {name}": values for name, values in (_attributes(prim) | {"pose": pose}).items()}
     np.savez(target, **content, facts=np.array(json.dumps(facts)))
+
+
+def _open(source: str) -> Any:
+    """Return the layer of a file, or end the program with the reason as its last line."""
+    from pxr import Sdf, Tf
+
+    try:
+        layer = Sdf.Layer.FindOrOpen(source)
+    except Tf.ErrorException as error:
+        sys.exit(error.args[0].commentary.strip())
+    if layer is None:
+        sys.exit("OpenUSD cannot open it")
+    return layer
 
 
 def _holds_gaussians(prim: Any) -> bool:
