@@ -77,13 +77,11 @@ def _nearest(
     served: ServedMap, points: NDArray[np.float64], n_sigma: float
 ) -> tuple[MahalanobisResult, NDArray[np.float32]]:
     """Return the nearest Gaussians, and the distances (P,) [m] at the standard deviations of motions, or infinity."""
-    unknown = np.full(len(points), np.inf, np.float32)
-    if served.tiles is None:
-        found = served.field.mahalanobis(points)
-        if n_sigma != _N_SIGMA:
-            return found, unknown
-        return found, served.field.clearance(points, cut=REACH).distance.astype(np.float32)
-    field = field_around(served.tiles, spheres(points)[0], "points", n_sigma=n_sigma)
+    tiled = None
+    if served.tiles is not None:
+        tiled = field_around(served.tiles, spheres(points)[0], "points", n_sigma=n_sigma)
+    found = (served.field if tiled is None else tiled).mahalanobis(points)
     if n_sigma != _N_SIGMA:
-        return field.mahalanobis(points), unknown
-    return field.mahalanobis(points), field.clearance(points).distance.astype(np.float32)
+        return found, np.full(len(points), np.inf, np.float32)
+    near = served.field.clearance(points, cut=REACH) if tiled is None else tiled.clearance(points)
+    return found, near.distance.astype(np.float32)
