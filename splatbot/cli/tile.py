@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from splatbot.cli.paths import check_output
+from splatbot.cli.paths import check_new, check_output
 from splatbot.errors import InputError
 from splatbot.layouts import TILES_NAME, is_map, log_layout, map_file
 
@@ -54,8 +54,8 @@ def tile(
     if is_map(out) or log_layout(out) or (out / "metrics.json").exists():
         hint = "name a folder of its own"
         raise InputError("is the folder of a run, a map or a log.", file=out, field="--out", hint=hint)
-    if (out / TILES_NAME).exists() and not overwrite:
-        raise InputError("exists already.", file=out, field="--out", hint="name another one, or give --overwrite")
+    if (out / TILES_NAME).exists():
+        check_new(out, overwrite=overwrite)
     if memory_mb is not None and not sweep:
         raise InputError("goes with --sweep.", field="--memory-mb", hint="give both, or leave it out")
 
@@ -89,13 +89,14 @@ def _sweep(model: GaussianModel, map_: Path, folder: Path, memory_mb: float) -> 
     from splatbot.cli.progress import steps
     from splatbot.cli.tables import print_columns, print_table
     from splatbot.results.units import count, milliseconds
-    from splatbot.tiles.sweep import score_queries, score_views
+    from splatbot.tiles import TiledMap
+    from splatbot.tiles.sweep import CONSTANTS, score_queries, score_views
 
-    with steps() as on_step:
+    with TiledMap(folder, memory_mb=memory_mb) as tiles, steps() as on_step:
         on_step("reference images")
         views, source = _views(model, map_)
         on_step("views")
-        scores = list(score_views(model, folder, views, memory_mb=memory_mb))
+        scores = list(score_views(model, tiles, views))
         on_step("queries")
         queries = score_queries(model, folder, memory_mb=memory_mb)
     table = Table("pixel error", "reached", "Gaussians", "load", "render", "PSNR", "least gain on the whole map")
@@ -119,7 +120,8 @@ def _sweep(model: GaussianModel, map_: Path, folder: Path, memory_mb: float) -> 
         ("spheres, hits", f"{count(queries.spheres)}, {count(queries.hits)}"),
         ("verdicts unlike the whole map's", count(queries.different)),
     ]
-    print_table(rows, title="collision queries in boxes of 1.5 m, each after a cold start; median times")
+    title = f"collision queries in boxes of {CONSTANTS.box:g} m, each after a cold start; median times"
+    print_table(rows, title=title)
 
 
 def _views(model: GaussianModel, map_: Path) -> tuple[list[SweepView], str]:
@@ -128,13 +130,14 @@ def _views(model: GaussianModel, map_: Path) -> tuple[list[SweepView], str]:
 
     from splatbot.cli.map_views import recorded_views
     from splatbot.spacing import evenly_spaced
-    from splatbot.tiles.sweep import SweepView, supersampled
+    from splatbot.tiles.sweep import CONSTANTS, SweepView, supersampled
     from splatbot.training.images import ImageCache
     from splatbot.training.map_views import around
 
     recorded = recorded_views(map_)
     if recorded is None or not recorded.held_out:
-        return [supersampled(model, *view) for view in around(model, _VIEWS)], "the whole map with 16 rays a pixel"
+        source = f"the whole map with {CONSTANTS.supersampling**2} rays a pixel"
+        return [supersampled(model, *view) for view in around(model, _VIEWS)], source
     chosen = evenly_spaced(recorded.held_out, _VIEWS)
     photos, black = ImageCache(chosen), torch.zeros(3)
     images = [photos.photo(number).over(black).numpy() for number in range(len(chosen))]

@@ -18,12 +18,12 @@ def describe_tiles(folder: Path) -> list[tuple[str, str]]:
 
     index = read_index(folder)
     tiles = index.tiles
-    size = sum((folder / name).stat().st_size for name in (DATA_NAME, TILES_NAME))
+    stored = sum((folder / name).stat().st_size for name in (DATA_NAME, TILES_NAME))
     rows = [
         ("Gaussians", count(index.gaussians)),
         ("SH degree", str(index.sh_degree)),
         ("map", index.source),
-        ("files", megabytes(size)),
+        ("files", megabytes(stored)),
         ("tiles", count(len(tiles))),
     ]
     for k, axis in enumerate("xyz" if tiles else ""):
@@ -36,6 +36,8 @@ def describe_tiles(folder: Path) -> list[tuple[str, str]]:
     for level in range(max(levels, default=-1) + 1):
         here = [tile for tile, own in zip(tiles, levels, strict=True) if own == level]
         edges = [tile.error for tile in here if tile.children]
-        cells = f"cells of {metres(min(edges))} to {metres(max(edges))}" if edges else "exact"
-        rows.append((f"level {level}", f"{count(sum(t.count for t in here))} Gaussians, {len(here)} tiles, {cells}"))
+        limits = dict.fromkeys(metres(edge) for edge in (min(edges), max(edges))) if edges else ()
+        cells = f"cells of {' to '.join(limits)}" if edges else "exact"
+        size = f"{count(sum(t.count for t in here))} Gaussians, {len(here)} tile{'s' if len(here) > 1 else ''}"
+        rows.append((f"level {level}", f"{size}, {cells}"))
     return rows

@@ -19,7 +19,8 @@ DATA_NAME = "tiles.bin"
 MAX_TILES = 100_000
 MAX_INDEX_BYTES = 64 * 2**20
 
-_HINT = "write the tiled map again: splatbot tile MAP --out FOLDER --overwrite"
+WRITE_AGAIN = "write the tiled map again: splatbot tile MAP --out FOLDER --overwrite"
+GIVE_TILES = "give a folder that `splatbot tile` wrote"
 _Length = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 _Point = tuple[
     Annotated[float, Field(allow_inf_nan=False)],
@@ -96,24 +97,23 @@ def read_index(folder: Path) -> TileIndex:
     try:
         found = file.stat()
         if not stat.S_ISREG(found.st_mode):
-            raise FormatError("is no file.", file=file, hint=_HINT)
+            raise FormatError("is no file.", file=file, hint=WRITE_AGAIN)
         if found.st_size > MAX_INDEX_BYTES:
-            raise FormatError(f"has more than {MAX_INDEX_BYTES:,} bytes.", file=file, hint=_HINT)
+            raise FormatError(f"has more than {MAX_INDEX_BYTES:,} bytes.", file=file, hint=WRITE_AGAIN)
         body = json.loads(file.read_bytes())
         if not isinstance(body, dict):
             raise ValueError("no object")
         if body.pop("sha256", None) != _digest(body):
-            raise FormatError("is damaged: its checksum does not fit.", file=file, field="sha256", hint=_HINT)
+            raise FormatError("is damaged: its checksum does not fit.", file=file, field="sha256", hint=WRITE_AGAIN)
         index = TileIndex.model_validate(body)
     except OSError as error:
-        hint = "give a folder that `splatbot tile` wrote"
-        raise FormatError(f"cannot be read ({error.strerror}).", file=file, hint=hint) from error
+        raise FormatError(f"cannot be read ({error.strerror}).", file=file, hint=GIVE_TILES) from error
     except ValidationError as error:
         first = error.errors()[0]
         field = ".".join(str(part) for part in first["loc"])
-        raise FormatError(f"is damaged: {first['msg']}.", file=file, field=field, hint=_HINT) from error
+        raise FormatError(f"is damaged: {first['msg']}.", file=file, field=field, hint=WRITE_AGAIN) from error
     except (ValueError, RecursionError) as error:
-        raise FormatError("is damaged: it is no JSON object.", file=file, hint=_HINT) from error
+        raise FormatError("is damaged: it is no JSON object.", file=file, hint=WRITE_AGAIN) from error
     _check_tree(file, index)
     return index
 
@@ -127,19 +127,19 @@ def _check_tree(file: Path, index: TileIndex) -> None:
     parents = [-1] * len(index.tiles)
     for number, tile in enumerate(index.tiles):
         if any(low > high for low, high in zip(tile.low, tile.high, strict=True)):
-            raise FormatError("is above high.", file=file, field=f"tiles.{number}.low", hint=_HINT)
+            raise FormatError("is above high.", file=file, field=f"tiles.{number}.low", hint=WRITE_AGAIN)
         if not tile.children and tile.error > 0:
-            raise FormatError("is not 0 for a leaf.", file=file, field=f"tiles.{number}.error", hint=_HINT)
+            raise FormatError("is not 0 for a leaf.", file=file, field=f"tiles.{number}.error", hint=WRITE_AGAIN)
         for child in tile.children:
             if child >= number or parents[child] >= 0:
                 field = f"tiles.{number}.children"
-                raise FormatError(f"has {child}, so the tiles are no tree.", file=file, field=field, hint=_HINT)
+                raise FormatError(f"has {child}, so the tiles are no tree.", file=file, field=field, hint=WRITE_AGAIN)
             parents[child] = number
     if -1 in parents[:-1]:
         field = f"tiles.{parents.index(-1)}"
-        raise FormatError("has no parent, so the tiles are no tree.", file=file, field=field, hint=_HINT)
+        raise FormatError("has no parent, so the tiles are no tree.", file=file, field=field, hint=WRITE_AGAIN)
     if sum(tile.count for tile in index.tiles if not tile.children) != index.gaussians:
-        raise FormatError("is not the number in the leaves.", file=file, field="gaussians", hint=_HINT)
+        raise FormatError("is not the number in the leaves.", file=file, field="gaussians", hint=WRITE_AGAIN)
 
 
 def _digest(body: dict[str, Any]) -> str:

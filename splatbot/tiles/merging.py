@@ -59,7 +59,7 @@ def merged(part: MapPart, most: int, least_edge: float = 0.0) -> tuple[MapPart, 
         else:
             high = middle
     edge = float(2.0**high)
-    return _of_moments(part, *_cells(means, scales, edge)), edge
+    return _of_moments(part, _cells(means, scales, edge)[0]), edge
 
 
 def _cells(means: Array, scales: Array, edge: float) -> tuple[Ints, int]:
@@ -73,12 +73,12 @@ def _cells(means: Array, scales: Array, edge: float) -> tuple[Ints, int]:
     return of, len(groups)
 
 
-def _of_moments(part: MapPart, of: Ints, n: int) -> MapPart:
+def _of_moments(part: MapPart, of: Ints) -> MapPart:
     """Return one Gaussian for each group: mean, covariance and colour by opacity times area, and their sum as opacity.
 
     Without members of its own, no keyframe supports it: a collision field ignores it.
     """
-    single = np.bincount(of, minlength=n)[of] == 1
+    single = np.bincount(of)[of] == 1
     alone, members = part.select(torch.from_numpy(single)), part.select(torch.from_numpy(~single))
     if not len(members):
         return alone

@@ -107,34 +107,30 @@ def supersampled(model: GaussianModel, camera: Camera, T_world_camera: Array) ->
     return SweepView(camera, T_world_camera, np.rint(255.0 * reference) / np.float32(255.0))
 
 
-def score_views(
-    model: GaussianModel, folder: Path, views: Sequence[SweepView], *, memory_mb: float
-) -> Iterator[TiledViewScore]:
+def score_views(model: GaussianModel, tiles: TiledMap, views: Sequence[SweepView]) -> Iterator[TiledViewScore]:
     """Yield the score of each pixel error.
 
     Args:
         model: the whole map.
-        folder: its tiled map.
+        tiles: its tiled map.
         views: one or more.
-        memory_mb: of the tiled map.
     """
     whole = [psnr(render_view(model, view.camera, view.T_world_camera), view.reference) for view in views]
-    with TiledMap(folder, memory_mb=memory_mb) as tiles:
-        for pixel_error in CONSTANTS.pixel_errors:
-            rows = []
-            for view, psnr_whole in zip(views, whole, strict=True):
-                start = time.perf_counter()
-                part = tiles.in_view(view.camera, view.T_world_camera, pixel_error=pixel_error)
-                loaded = time.perf_counter()
-                image = render_view(part.model, view.camera, view.T_world_camera)
-                rendered = time.perf_counter()
-                own = psnr(image, view.reference)
-                times = 1e3 * (loaded - start), 1e3 * (rendered - loaded)
-                rows.append((part.pixel_error, len(part.model), *times, own, own - psnr_whole))
-            table = np.array(rows)
-            _, gaussians, load_ms, render_ms, own, _ = table.mean(axis=0).tolist()
-            reached, least = float(table[:, 0].max()), float(table[:, 5].min())
-            yield TiledViewScore(pixel_error, reached, round(gaussians), load_ms, render_ms, own, least)
+    for pixel_error in CONSTANTS.pixel_errors:
+        rows = []
+        for view, psnr_whole in zip(views, whole, strict=True):
+            start = time.perf_counter()
+            part = tiles.in_view(view.camera, view.T_world_camera, pixel_error=pixel_error)
+            loaded = time.perf_counter()
+            image = render_view(part.model, view.camera, view.T_world_camera)
+            rendered = time.perf_counter()
+            own = psnr(image, view.reference)
+            times = 1e3 * (loaded - start), 1e3 * (rendered - loaded)
+            rows.append((part.pixel_error, len(part.model), *times, own, own - psnr_whole))
+        table = np.array(rows)
+        _, gaussians, load_ms, render_ms, own, _ = table.mean(axis=0).tolist()
+        reached, least = float(table[:, 0].max()), float(table[:, 5].min())
+        yield TiledViewScore(pixel_error, reached, round(gaussians), load_ms, render_ms, own, least)
 
 
 def score_queries(model: GaussianModel, folder: Path, *, memory_mb: float) -> TiledQueryScore:

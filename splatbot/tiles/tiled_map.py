@@ -24,7 +24,7 @@ from splatbot.gaussians import GaussianModel
 from splatbot.geometry import inverse, transform_points
 from splatbot.protocols import Array
 from splatbot.tiles.field import TiledField, checked_box
-from splatbot.tiles.index import DATA_NAME, TileIndex, read_index
+from splatbot.tiles.index import DATA_NAME, GIVE_TILES, WRITE_AGAIN, TileIndex, read_index
 from splatbot.tiles.part import MapPart, bytes_each, decode
 
 Numbers = NDArray[np.int64]
@@ -58,6 +58,7 @@ class TiledMapConstants:
 
 
 CONSTANTS = TiledMapConstants()
+_RESTORE = "restore it from a copy, or write the tiled map again"
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +113,7 @@ class TiledMap:
         self._high = np.array([tile.high for tile in tiles]).reshape(-1, 3)
         self._scales = np.maximum([tile.scale for tile in tiles], SCALE_FLOOR)
         self._leaves = np.array([not tile.children for tile in tiles], np.bool_)
-        for number in np.flatnonzero(~self._leaves).tolist():  # children come first; earlier writers did not nest
+        for number in np.flatnonzero(~self._leaves).tolist():  # children come first; bounds in a file may not be nested
             family = [number, *tiles[number].children]
             self._low[number], self._high[number] = self._low[family].min(axis=0), self._high[family].max(axis=0)
             self._scales[number] = self._scales[family].max()
@@ -291,9 +292,8 @@ class TiledMap:
         data = bytearray(int(self._counts[number]) * self._bytes_each)
         size = os.preadv(self._file, [data], self._starts[number] * self._bytes_each)
         if size != len(data) or hashlib.sha256(data).hexdigest() != self.index.tiles[number].sha256:
-            hint = "restore it from a copy, or write the tiled map again"
-            field = f"tile {number}"
-            raise FormatError("is damaged: its checksum does not fit.", file=self._path, field=field, hint=hint)
+            problem, field = "is damaged: its checksum does not fit.", f"tile {number}"
+            raise FormatError(problem, file=self._path, field=field, hint=_RESTORE)
         return data
 
     def _check(self, part: MapPart, number: int) -> None:
@@ -313,8 +313,7 @@ class TiledMap:
             "has rows that the map lacks": bool(((rows < 0) | (rows >= self.index.gaussians)).any()),
         }
         for problem in (text for text, is_wrong in problems.items() if is_wrong):
-            hint = "write the tiled map again: splatbot tile MAP --out FOLDER --overwrite"
-            raise FormatError(f"{problem}.", file=self._path, field=f"tile {number}", hint=hint)
+            raise FormatError(f"{problem}.", file=self._path, field=f"tile {number}", hint=WRITE_AGAIN)
 
     @property
     def _path(self) -> Path:
@@ -343,11 +342,9 @@ def _open(path: Path, size: int) -> int:
     try:
         file = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # a pipe would wait for its writer
     except OSError as error:
-        hint = "give a folder that `splatbot tile` wrote"
-        raise FormatError(f"cannot be read ({error.strerror}).", file=path, hint=hint) from error
+        raise FormatError(f"cannot be read ({error.strerror}).", file=path, hint=GIVE_TILES) from error
     found = os.fstat(file)
     if not stat.S_ISREG(found.st_mode) or found.st_size != size:
         os.close(file)
-        hint = "restore it from a copy, or write the tiled map again"
-        raise FormatError(f"is no file of {size:,} bytes.", file=path, hint=hint)
+        raise FormatError(f"is no file of {size:,} bytes.", file=path, hint=_RESTORE)
     return file

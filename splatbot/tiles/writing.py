@@ -143,7 +143,7 @@ class _TileWriter:
             count=len(part),
             low=tuple(np.min([means.amin(0).tolist(), *(child.low for child in inner)], axis=0).tolist()),
             high=tuple(np.max([means.amax(0).tolist(), *(child.high for child in inner)], axis=0).tolist()),
-            scale=max(float(part.model.scales.max()), *(child.scale for child in inner), 0.0),
+            scale=max([float(part.model.scales.max()), *(child.scale for child in inner)]),
             error=error,
             sha256=hashlib.sha256(data).hexdigest(),
         )

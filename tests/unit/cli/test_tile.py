@@ -41,7 +41,8 @@ def test_the_folder_is_described_by_levels(run: RunCommand, tiled: Path) -> None
     answer = run("info", tiled)
     assert answer.code == 0, answer.err
     assert re.search(r"Gaussians +2,000\n", answer.out)
-    assert re.search(r"level 0 .* 1 tiles, cells of", answer.out)
+    assert re.search(r"level 0 .* 1 tile, cells of [\d.]+ c?m$", answer.out, re.MULTILINE)
+    assert re.search(r"level 2 .* \d tiles, cells of [\d.]+ c?m to [\d.]+ c?m$", answer.out, re.MULTILINE)
     assert len(re.findall("exact", answer.out)) == 1
     assert "map.ply" in answer.out
 
@@ -108,6 +109,7 @@ def test_options_that_do_not_fit_are_refused(run: RunCommand, source: Path, tile
     assert_fix_named(run("tile", tiled, "--out", "other"), "tiled map")
     assert_fix_named(run("tile", source, "--out", "other", "--memory-mb", 4), "--sweep")
     assert_fix_named(run("tile", source, "--out", "other", "--tile-gaussians", 1), "tile_gaussians")
+    assert_fix_named(run("tile", source, "--out", "small", "--sweep", "--memory-mb", 0.001), "memory_mb")
     assert_fix_named(run("tile", source, "--out", source), "--out")
 
 
