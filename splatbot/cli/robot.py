@@ -9,6 +9,7 @@ import tyro
 
 if TYPE_CHECKING:
     from splatbot.robots.bodies.check import Part
+    from splatbot.robots.joints import Joint
     from splatbot.robots.robot import RobotModel
 
 
@@ -256,20 +257,12 @@ def _info(name: str) -> None:
 
     model = load_robot(name)
     spheres = model.spheres()
-    rows = [
-        (
-            j.name,
-            f"{j.lower:+.4f} .. {j.upper:+.4f} {unit}, at most {j.velocity:g} {unit}/s, {j.acceleration:g} {unit}/s², "
-            f"{j.effort:g} {effort}",
-        )
-        for j in model.joints
-        for unit, effort in (("m", "N") if j.prismatic else ("rad", "Nm"),)
-    ]
+    rows = [(joint.name, _joint_text(joint)) for joint in model.joints]
     print_table(rows, title=f"{model.name}: {len(model)} joints")
     print_table(
         [
             ("spheres", f"{len(spheres)}, radius {spheres.radii.min():.3f} .. {spheres.radii.max():.3f} m"),
-            ("slack", f"at most {1e3 * model.slack:.3g} mm of the spheres beyond the geometry"),
+            ("slack", f"the spheres reach at most {1e3 * model.slack:.3g} mm beyond the geometry"),
             ("pairs of links that may not touch", str(len(model.self_collision_pairs))),
             ("home", " ".join(f"{value:.4g}" for value in model.home) + f" {_unit_of(model)}"),
             ("gripper", _gripper_text(model)),
@@ -278,6 +271,12 @@ def _info(name: str) -> None:
             *([("mass", f"last link with its hand {model.inertials[-1].mass:.3g} kg")] if model.inertials else []),
         ]
     )
+
+
+def _joint_text(joint: Joint) -> str:
+    unit, effort = ("m", "N") if joint.prismatic else ("rad", "Nm")
+    limits = f"at most {joint.velocity:g} {unit}/s, {joint.acceleration:g} {unit}/s², {joint.effort:g} {effort}"
+    return f"{joint.lower:+.4f} .. {joint.upper:+.4f} {unit}, {limits}"
 
 
 def _unit_of(model: RobotModel) -> str:
