@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from splatbot.bench.tabletop import Block, Tabletop
-from splatbot.sim.page import surface_points, twin_html
+from splatbot.sim.page import recording_html, surface_points, twin_html
 from splatbot.sim.recording import CONSTANTS as RECORDING
 from splatbot.sim.recording import TwinRecording
 from splatbot.sim.scene import load_scene, make_scene
@@ -122,6 +122,12 @@ def test_the_page_names_all_that_it_draws_and_fits_a_phone(browser: str, tmp_pat
             assert chromium.evaluate("getComputedStyle(document.body).backgroundColor") == page_color
             assert chromium.evaluate("document.documentElement.scrollWidth") <= 360
             assert chromium.evaluate("document.getElementById('view').clientHeight") > 150
+
+
+def test_the_legend_calls_only_the_named_target_a_completed_surface() -> None:
+    recording, result = recorded()
+    assert "mug: its completed surface</li>" in recording_html(recording, title="x", facts="", target="mug")
+    assert "completed surface" not in twin_html(recording, result)
 
 
 def test_a_map_is_shown_by_its_gaussians_less_those_that_move(tmp_path: Path) -> None:
