@@ -103,7 +103,7 @@ def _verdicts(item: ListedObject) -> tuple[str, str]:
 _MEANINGS = {
     "fits": "the hand encloses it by its size; splatbot grasp also checks its sides and surroundings",
     "yes": "a posture of the arm takes the tool to its centre; obstacles are not checked",
-    "no": "beyond the arm, or no posture; --json has the reason of the hand",
+    "no": "beyond the reach of the arm, or no posture takes the tool to its centre",
     "no hand": "the robot has no hand; --robot takes one that has",
     "too flat": "lower than 12 mm, so that no hand encloses it",
     "too wide": "its faces are farther apart than the hand opens, less 2 mm at each pad",
