@@ -22,6 +22,7 @@ RECORD, OUTPUT = "item.json", "item.log"
 """Files of an item in addition to those of its command: the record of its end, and the text that it printed."""
 
 _ATTEMPTS = 2  # at an item whose process gets SIGKILL, as by the kernel when memory is short
+_CUT_OFF = (INTERRUPTED, -signal.SIGINT)  # Ctrl-C reaches a process that has not left the group of its supervisor yet
 _THREADS = ("SPLATBOT_NUM_THREADS", "OMP_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 
 
@@ -119,7 +120,7 @@ def run_item(item: BatchItem, batch: Path, place: Path, threads: int, leash: int
                 break
     error = "" if code == 0 else _error(code, folder / OUTPUT)
     record = ItemRecord(item.words, item.settings, code, round(time.monotonic() - started, 3), error)
-    if code != INTERRUPTED:
+    if code not in _CUT_OFF:
         record.save(folder)
     return record
 

@@ -53,6 +53,19 @@ def test_a_failed_item_begins_with_an_empty_folder_and_may_get_other_words(tmp_p
     assert {path.name for path in (tmp_path / "item").iterdir()} == {"item.json", "item.log"}
 
 
+def test_an_item_that_ctrl_c_ends_before_it_has_its_own_process_group_stays_unfinished(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    program = tmp_path / "program"
+    program.write_text("#!/bin/sh\nkill -INT $$\n")
+    program.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(program))
+    item = BatchItem("item", LISTS)
+    assert run(tmp_path / "batch", item)["item"].code == -signal.SIGINT
+    assert unfinished([item], tmp_path / "batch") == [item]
+    assert [row["state"] for row in batch_rows([item], tmp_path / "batch")] == ["unfinished"]
+
+
 @pytest.mark.parametrize("other", [BatchItem("item", FAILS), BatchItem("item", LISTS, {"SPLATBOT_SEED": "3"})])
 def test_a_result_of_another_command_line_is_refused(tmp_path: Path, other: BatchItem) -> None:
     run(tmp_path, BatchItem("item", LISTS))
