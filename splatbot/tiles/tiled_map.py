@@ -180,9 +180,7 @@ class TiledMap:
         parts = [MapPart.empty(self.index.sh_degree)]
         for number in found.tolist():
             part = self._load(number)
-            means = part.model.means.numpy().astype(np.float64)
-            scales = np.exp(part.model.log_scales.numpy().max(axis=1).astype(np.float64)).clip(SCALE_FLOOR)
-            parts.append(part.select(torch.from_numpy(np.flatnonzero(_meets(box, means, means, reach * scales)))))
+            parts.append(part.select(torch.from_numpy(_rows_near(box, part, reach, float(self._scales[number])))))
         return MapPart.union(parts)
 
     def field(self, low: ArrayLike, high: ArrayLike, n_sigma: float = 2.0, *, reach: float = 0.0) -> TiledField:
@@ -303,14 +301,18 @@ class TiledMap:
             FormatError: they are not.
         """
         model = part.model
-        means, scales = model.means.numpy(), np.exp(model.log_scales.numpy().astype(np.float64))
-        rows, most = part.rows.numpy(), (1.0 + CONSTANTS.scale_slack) * self._scales[number]
+        columns = {column.name: getattr(model, column.name).numpy() for column in fields(model)}
+        means, quats, rows = columns["means"], columns["quats"], part.rows.numpy()
+        scale = float(np.exp(columns["log_scales"].max(initial=-np.inf).astype(np.float64)))
+        low, high = self._low[number], self._high[number]
         problems = {
-            "is not finite": any(not torch.isfinite(getattr(model, column.name)).all() for column in fields(model)),
-            "has a quaternion of zeros": bool((model.quats == 0).all(dim=1).any()),
-            "leaves its box": bool(((means < self._low[number]) | (means > self._high[number])).any()),
-            "exceeds its scale": bool((scales > most).any()),
-            "has rows that the map lacks": bool(((rows < 0) | (rows >= self.index.gaussians)).any()),
+            "is not finite": any(not np.isfinite(values).all() for values in columns.values()),
+            "has a quaternion of zeros": bool((quats[quats[:, 0] == 0] == 0).all(axis=1).any()),
+            "leaves its box": any(
+                m.min() < least or m.max() > most for m, least, most in zip(means.T, low, high, strict=True)
+            ),
+            "exceeds its scale": scale > (1.0 + CONSTANTS.scale_slack) * self._scales[number],
+            "has rows that the map lacks": rows.min() < 0 or rows.max() >= self.index.gaussians,
         }
         for problem in (text for text, is_wrong in problems.items() if is_wrong):
             raise FormatError(f"{problem}.", file=self._path, field=f"tile {number}", hint=WRITE_AGAIN)
@@ -325,6 +327,21 @@ def _enlarged(box: tuple[Array, Array]) -> tuple[Array, Array]:
     low, high = box
     room = CONSTANTS.box_slack * (np.linalg.norm(high - low) + np.abs(box).max())
     return low - room, high + room
+
+
+def _rows_near(box: tuple[Array, Array], part: MapPart, reach: float, scale: float) -> Numbers:
+    """Return the rows of a tile whose ellipsoids of ``reach`` standard deviations may meet a box.
+
+    Columns are compared with the bound of the tile's largest standard deviation ``scale`` [m] first: few rows remain.
+    """
+    means, log_scales = part.model.means.numpy(), part.model.log_scales.numpy()
+    room = reach * (1.0 + CONSTANTS.scale_slack) * scale
+    near = np.ones(len(part), np.bool_)
+    for along, low, high in zip(means.T, *box, strict=True):
+        near &= (along >= low - room) & (along <= high + room)
+    rows = np.flatnonzero(near)
+    centres, scales = means[rows].astype(np.float64), np.exp(log_scales[rows].astype(np.float64).max(axis=1))
+    return rows[_meets(box, centres, centres, reach * scales.clip(SCALE_FLOOR))]
 
 
 def _meets(box: tuple[Array, Array], low: Array, high: Array, reach: Array) -> NDArray[np.bool_]:
