@@ -15,7 +15,7 @@ REACH = 1.0  # [m] farther distances are unknown
 def field_around(
     tiles: TiledMap, centres: NDArray[np.float64], name: str, *, room: float = 0.0, n_sigma: float = 2.0
 ) -> TiledField:
-    """Return the field of the box of finite ``centres`` (P, 3) [m], enlarged by ``room`` [m].
+    """Return the field around the box of finite ``centres`` (P, 3) [m], enlarged by ``room`` [m]; requests share it.
 
     Args:
         tiles: the map.
@@ -29,7 +29,7 @@ def field_around(
     """
     around = centres if len(centres) else np.zeros((1, 3))
     try:
-        return tiles.field(around.min(axis=0) - room, around.max(axis=0) + room, n_sigma, reach=REACH)
+        return tiles.shared_field(around.min(axis=0) - room, around.max(axis=0) + room, n_sigma, reach=REACH)
     except TileMemoryError as error:
         hint = "send rows that are closer together, or raise SPLATBOT_TILES_MB"
         raise InputError(error.message, field=name, hint=hint) from error

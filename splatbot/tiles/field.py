@@ -31,6 +31,11 @@ class TiledField:
     high: Array
     reach: float
 
+    @property
+    def nbytes(self) -> int:
+        """Memory of the field and of its rows [bytes]."""
+        return self.field.nbytes + self.rows.nbytes
+
     def in_collision(self, points: ArrayLike | Tensor) -> NDArray[np.bool_]:
         """Check whether each of ``points`` (P, 3) or spheres (P, 4) inside the box may collide with a Gaussian (P,).
 

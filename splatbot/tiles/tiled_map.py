@@ -24,6 +24,7 @@ from splatbot.gaussians import GaussianModel
 from splatbot.geometry import inverse, transform_points
 from splatbot.protocols import Array
 from splatbot.tiles.field import TiledField, checked_box
+from splatbot.tiles.fields import FieldCache
 from splatbot.tiles.index import DATA_NAME, GIVE_TILES, WRITE_AGAIN, TileIndex, read_index
 from splatbot.tiles.part import MapPart, bytes_each, decode
 
@@ -35,7 +36,8 @@ class TiledMapConstants:
     """Constants of tiled maps.
 
     Args:
-        memory_mb: default of the memory of tiles, and of the largest answer.
+        memory_mb: default of the memory of tiles, of shared fields, and of the largest answer.
+        lattice: [m] edge of the cells that the box of a shared field consists of.
         pixel_error: default of the largest edge of a cell of merged Gaussians in a view [px].
         slack: share by which ellipsoids grow in queries, for the rounding of a field.
         box_slack: share of its diagonal and of its largest coordinate by which a box grows, for the same.
@@ -47,6 +49,7 @@ class TiledMapConstants:
     """
 
     memory_mb: float = 24.0
+    lattice: float = 0.5
     pixel_error: float = 1.0
     slack: float = 1e-4
     box_slack: float = 4e-6
@@ -86,12 +89,12 @@ class TileMemoryError(InputError):
 class TiledMap:
     """A map in a folder that `splatbot tile` wrote; any number of threads may query it.
 
-    Tiles are read when a query needs them. The latest ones stay in memory, up to ``memory_mb``. An answer of Gaussians
-    takes at most as much again. The file is closed with the last reference to the map.
+    Tiles are read when a query needs them. The latest ones stay in memory, up to ``memory_mb``. Shared fields take at
+    most as much again, and so does an answer of Gaussians. The file is closed with the last reference to the map.
 
     Args:
         folder: of the tiled map.
-        memory_mb: largest memory of tiles [MB].
+        memory_mb: largest memory of tiles, and of shared fields [MB].
 
     Raises:
         FormatError: the index is missing or damaged, or the data does not have its size.
@@ -106,6 +109,7 @@ class TiledMap:
         self._starts = self.index.starts
         self._most = int(memory_mb * 1e6 / self._bytes_each) if 0 < memory_mb < np.inf else 0
         self._cache: OrderedDict[int, MapPart] = OrderedDict()
+        self.fields = FieldCache(memory_mb * 1e6)
         self._lock = threading.Lock()
         tiles = self.index.tiles
         self._counts = np.array([tile.count for tile in tiles], np.int64)
@@ -124,7 +128,8 @@ class TiledMap:
         self._close_file = weakref.finalize(self, os.close, self._file)
 
     def close(self) -> None:
-        """Close the file of the tiles; later queries raise an OSError."""
+        """Close the file of the tiles; later queries of tiles raise an OSError."""
+        self.fields.clear()
         with self._lock:
             self._cache.clear()
             self._close_file()
@@ -141,9 +146,9 @@ class TiledMap:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the tiles in memory."""
+        """Bytes of the tiles and of the shared fields in memory."""
         with self._lock:
-            return sum(part.nbytes for part in self._cache.values())
+            return sum(part.nbytes for part in self._cache.values()) + self.fields.nbytes
 
     @property
     def box(self) -> tuple[Array, Array]:
@@ -200,6 +205,19 @@ class TiledMap:
             raise InputError(f"is {reach}.", field="reach", hint="give metres, 0 or more")
         part = self.near(box[0] - reach, box[1] + reach, n_sigma)
         return TiledField(GaussianCollisionField(part.model, n_sigma), part.rows.numpy(), box[0], box[1], reach)
+
+    def shared_field(self, low: ArrayLike, high: ArrayLike, n_sigma: float = 2.0, *, reach: float = 0.0) -> TiledField:
+        """Return the field of the cells of a lattice that a box meets; the next box in the same cells has the same one.
+
+        Args:
+            low, high, n_sigma, reach: see :meth:`field`.
+
+        Raises:
+            InputError: see :meth:`field`.
+        """
+        first, last = (corner - np.mod(corner, CONSTANTS.lattice) for corner in checked_box(low, high))
+        key = (tuple(first.tolist()), tuple((last + CONSTANTS.lattice).tolist()), n_sigma, reach)
+        return self.fields.get(key, lambda: self.field(key[0], key[1], n_sigma, reach=reach))
 
     def in_view(
         self, camera: Camera, T_world_camera: ArrayLike, *, pixel_error: float = CONSTANTS.pixel_error

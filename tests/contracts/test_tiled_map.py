@@ -83,6 +83,27 @@ def test_distances_are_those_of_the_whole_map_up_to_their_bounds(service: Servic
         assert tiles["index"][row] == (whole["index"][row] if inside else -1)
 
 
+def test_one_point_queries_of_one_place_build_one_field_within_the_memory(model: GaussianModel, tmp_path: Path) -> None:
+    write_tiles(model, tmp_path, tile_gaussians=300)
+    store = MapStore()
+    with TiledMap(tmp_path, memory_mb=10.0) as tiles:
+        store.add("tiles", source="tiles", state="static", awaited=False, tiles=tiles)
+        with running(ServiceSettings(), store) as service:
+
+            def ask(point: list[float]) -> dict[str, object]:
+                answer = service.client.post("/v1/maps/tiles/distance", json={"points": [point]})
+                assert answer.status_code == 200, answer.text
+                return dict(answer.json())
+
+            first = ask([6.1, 6.1, 0.2])
+            assert (ask([6.1, 6.1, 0.2]), ask([6.3, 6.2, 0.1])["map_version"]) == (first, 1)
+            assert tiles.fields.builds == 1
+            for x in np.arange(0.2, 12.0, 1.5):
+                assert ask([float(x), 6.1, 0.2]) == ask([float(x), 6.1, 0.2])
+                assert tiles.fields.nbytes <= 10e6
+    assert tiles.fields.builds == 1 + 8
+
+
 def test_views_of_near_surfaces_are_those_of_the_whole_map(service: Service) -> None:
     body = {"camera": CAMERA, "mode": "rgb", **POSE}
     whole, tiles = both(service, "render", body)
