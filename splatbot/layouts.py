@@ -35,7 +35,7 @@ MAP_NAME = "map.ply"
 TILES_NAME = "tiles.json"
 RECORDING = "recording.mcap"
 TRAINING_NAME = "training.json"
-MAP_SUFFIXES = (".ply", ".splat", ".spz", ".sbz", ".sog", ".glb", ".usd", ".usda", ".usdc", ".usdz")
+MAP_SUFFIXES = (".ply", ".splat", ".ksplat", ".spz", ".sbz", ".sog", ".glb", ".usd", ".usda", ".usdc", ".usdz")
 """Ends of the names of map files that splatbot.formats reads."""
 
 _SOG_NAME = "meta.json"  # of a map in a folder of WebP images
@@ -52,7 +52,6 @@ _COLMAP_MODELS = ("sparse/0", "sparse", ".", "0")  # in the folder of a scene, t
 _HEAD = 2**20  # bytes of a JSON file that hold its description, or its first frames
 _AS_TUM = "write rgb/, depth/ (16-bit PNG), rgb.txt, depth.txt and intrinsics.json (docs/guide/mapping.md)"
 _FROM_A_LOG = f"map a recording; splatbot reads files of Gaussians ({', '.join(MAP_SUFFIXES)})"
-_AS_PLY = "open it in https://superspl.at/editor and export it as PLY"
 
 _PACKED = {
     ".zip": ("a ZIP archive", "unzip"),
@@ -82,7 +81,6 @@ _FOREIGN_LOGS = {
     ),
 }
 _FOREIGN_MAPS = {
-    ".ksplat": ("a .ksplat file", _AS_PLY),
     ".gltf": ("a glTF file in several parts", "pack it as one .glb file"),
     **dict.fromkeys((".pcd", ".las", ".e57"), ("a point cloud", _FROM_A_LOG)),
     **dict.fromkeys((".obj", ".stl"), ("a mesh", _FROM_A_LOG)),

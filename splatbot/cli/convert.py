@@ -25,11 +25,13 @@ def convert(
     *,
     sh_degree: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
     spz_version: Annotated[Literal[2, 3, 4] | None, tyro.conf.arg(metavar="2|3|4")] = None,
+    ksplat_level: Annotated[Literal[0, 1, 2] | None, tyro.conf.arg(metavar="0|1|2")] = None,
 ) -> int:
     """Write a map in another format of Gaussian splats, as the suffix of OUT says.
 
-    The suffixes are .ply (3DGS PLY), .compressed.ply, .splat, .spz, .sbz, .sog, _sog (a folder), .glb (glTF with
-    KHR_gaussian_splatting), .usd, .usda, .usdc and .usdz (OpenUSD). The format of MAP is detected from its content.
+    The suffixes are .ply (3DGS PLY), .compressed.ply, .splat, .ksplat, .spz, .sbz, .sog, _sog (a folder), .glb (glTF
+    with KHR_gaussian_splatting), .usd, .usda, .usdc and .usdz (OpenUSD). The format of MAP is detected from its
+    content.
 
     Prints the losses. Only .ply keeps all values. The bookkeeping of splatbot (observations, anchors, uncertainty and
     misses of each Gaussian) is kept by .ply and .sbz.
@@ -41,19 +43,22 @@ def convert(
         splatbot convert runs/desk desk.usdz
         splatbot convert map.ply map.compressed.ply --sh-degree 0
         splatbot convert map.ply map.spz --spz-version 4
+        splatbot convert map.ply map.ksplat --ksplat-level 2
 
     Args:
         map: a map file, a run folder, or the folder of a SOG.
         out: file or folder to write.
         sh_degree: highest degree of spherical harmonics to keep; by default all that the format stores.
         spz_version: version of an .spz file; by default 3, which every reader of version 4 reads too.
+        ksplat_level: compression level of a .ksplat file, by default 1. Level 0 keeps float32; 2 has 8 bits a harmonic.
     """
     file, target = map_file(map), find_format(out)
     check_output(out, "OUT", folder=target.suffix == "_sog")
     if sh_degree is not None and not 0 <= sh_degree <= _HIGHEST_SH_DEGREE:
         raise InputError(f"is {sh_degree}.", field="--sh-degree", hint=f"give 0 to {_HIGHEST_SH_DEGREE}")
-    if spz_version is not None and target.module != "spz":
-        raise InputError("is for .spz files.", field="--spz-version", hint="leave it out, or write an .spz file")
+    for option, value, module in (("--spz-version", spz_version, "spz"), ("--ksplat-level", ksplat_level, "ksplat")):
+        if value is not None and target.module != module:
+            raise InputError(f"is for .{module} files.", field=option, hint=f"leave it out, or name OUT .{module}")
     if out.resolve() in (file.resolve(), file.resolve().parent):
         raise InputError("is the input.", file=out, field="OUT", hint="name another file")
 
@@ -61,8 +66,8 @@ def convert(
 
     model = load_gaussians(file)
     kept = _limited(model, _kept_degree(model, target, sh_degree, spz_version))
-    _save(kept, out, target, spz_version)
-    notes = _losses(model, kept, target)
+    _save(kept, out, target, spz_version, ksplat_level)
+    notes = _losses(model, kept, target, _rounded(kept, target, ksplat_level))
     print(
         f"{out}: {count(len(kept))} Gaussians, SH degree {kept.sh_degree}, "
         f"{megabytes(_size(file))} to {megabytes(_size(out))}; {'; '.join(notes) or 'lost nothing'}"
@@ -83,7 +88,13 @@ def _limited(model: GaussianModel, degree: int) -> GaussianModel:
     return replace(model, sh=model.sh[:, : (degree + 1) ** 2].contiguous())
 
 
-def _save(model: GaussianModel, out: Path, target: MapFormat, spz_version: Literal[2, 3, 4] | None) -> None:
+def _save(
+    model: GaussianModel,
+    out: Path,
+    target: MapFormat,
+    spz_version: Literal[2, 3, 4] | None,
+    ksplat_level: Literal[0, 1, 2] | None,
+) -> None:
     if target.module == "ply":
         from splatbot.formats.ply import save_ply
 
@@ -92,6 +103,10 @@ def _save(model: GaussianModel, out: Path, target: MapFormat, spz_version: Liter
         from splatbot.formats.spz import save_spz
 
         save_spz(model, out, spz_version)
+    elif ksplat_level is not None:
+        from splatbot.formats.ksplat import save_ksplat
+
+        save_ksplat(model, out, ksplat_level)
     else:
         target.save(model, out)
 
@@ -102,13 +117,18 @@ def _has_bookkeeping(model: GaussianModel) -> bool:
     return not (plain and not model.uncertainty.any() and not model.misses.any())
 
 
-def _losses(model: GaussianModel, kept: GaussianModel, target: MapFormat) -> list[str]:
+def _rounded(kept: GaussianModel, target: MapFormat, ksplat_level: int | None) -> str:
+    """Return the values that are not stored as float32, for users."""
+    if ksplat_level == 0:
+        return "colours, opacities"
+    return f"{target.rounded}, harmonics" if target.rounded and kept.sh_degree else target.rounded
+
+
+def _losses(model: GaussianModel, kept: GaussianModel, target: MapFormat, rounded: str) -> list[str]:
     lost = [f"SH degree {model.sh_degree} to {kept.sh_degree}"] if kept.sh_degree < model.sh_degree else []
     lost += ["bookkeeping"] if not target.has_bookkeeping and _has_bookkeeping(model) else []
     notes = [f"lost: {', '.join(lost)}"] if lost else []
-    rounded = [target.rounded] if target.rounded else []
-    rounded += ["harmonics"] if rounded and kept.sh_degree else []
-    return notes + ([f"rounded: {', '.join(rounded)}"] if rounded else [])
+    return notes + ([f"rounded: {rounded}"] if rounded else [])
 
 
 def _size(path: Path) -> int:

@@ -56,6 +56,7 @@ FORMATS = (
     MapFormat("compressed PLY", ".compressed.ply", "compressed_ply", 3, _ALL),
     MapFormat("3DGS PLY", ".ply", "ply", 4, has_bookkeeping=True),
     MapFormat(".splat", ".splat", "splat", 0, "rotations, colours, opacities"),
+    MapFormat(".ksplat", ".ksplat", "ksplat", 2, _ALL),
     MapFormat("SPZ", ".spz", "spz", 4, _ALL),
     MapFormat("SBZ", ".sbz", "sbz", 0, f"{_ALL}, uncertainty", has_bookkeeping=True),
     MapFormat("SOG", ".sog", "sog", 3, _ALL),
@@ -74,7 +75,7 @@ WRITTEN = tuple(entry.suffix[1:] for entry in FORMATS if entry.suffix.startswith
 _KNOWN = ", ".join(f"{entry.name} ({entry.suffix})" for entry in FORMATS)
 _BY_MODULE = {entry.module: entry for entry in reversed(FORMATS)}
 _MAGIC = {b"ply": "ply", b"NGSP": "spz", b"SBZ": "sbz", b"\x1f\x8b": "spz", b"PK": "sog", b"{": "sog", b"glTF": "glb"}
-_MAGIC |= {b"#usd": "usd", b"PXR-": "usd"}
+_MAGIC |= {b"#usd": "usd", b"PXR-": "usd", b"\0\1\0\0": "ksplat"}
 
 
 def load_gaussians(path: str | Path) -> GaussianModel:

@@ -9,6 +9,7 @@ last. Axes are x right, y down, z forward (RDF), as in COLMAP and OpenCV.
 | 3DGS PLY | RDF | logarithm | logit | wxyz |
 | compressed PLY | RDF | logarithm | 0..1 | wxyz |
 | .splat | RDF | linear | 0..1 | wxyz |
+| .ksplat | RDF | linear | 0..1 | wxyz |
 | SPZ | RUB (:data:`RUB`) | logarithm | 0..1 | xyzw |
 | SOG | RDF | logarithm | 0..1 | wxyz |
 | glTF | LUF (:data:`LUF`) | linear | 0..1 | xyzw |
@@ -135,6 +136,20 @@ def sigmoid(logits: Table) -> NDArray[np.float64]:
 def linear_scales(log_scales: Table) -> Table:
     """Convert logarithms of scales (N, 3) to scales [m] within the normal range of float32."""
     return np.exp(np.clip(log_scales.astype(np.float64), -87.0, 88.0)).astype(np.float32)
+
+
+def log_scales_of(path: str | Path, scales: Table) -> NDArray[np.float64]:
+    """Convert scales (N, 3) [m] to their logarithms; that of 0 is -inf, which :func:`model_of` replaces.
+
+    Raises:
+        FormatError: a scale is negative.
+    """
+    negative = (scales < 0).any(axis=1)
+    if negative.any():
+        message, hint = f"row {int(np.argmax(negative))} has a negative scale.", "export it again with linear scales"
+        raise FormatError(message, file=path, field="scale", hint=hint)
+    with np.errstate(divide="ignore"):
+        return np.log(scales.astype(np.float64))
 
 
 def colors_of(sh: Table) -> NDArray[np.float64]:

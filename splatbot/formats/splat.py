@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 
 from splatbot.atomic import atomic_write
-from splatbot.errors import FormatError
 from splatbot.formats.checks import check_count, damaged, read_bytes
 from splatbot.formats.conventions import (
     SplatArrays,
     colors_of,
     dc_of,
     linear_scales,
+    log_scales_of,
     logit,
     model_of,
     sigmoid,
@@ -43,19 +43,10 @@ def load_splat(path: str | Path) -> GaussianModel:
     if len(data) % _ROW.itemsize:
         raise damaged(path, "rows", f"{len(data)} bytes are no multiple of {_ROW.itemsize}")
     rows = np.frombuffer(data, _ROW)
-    negative = (rows["scale"] < 0).any(axis=1)
-    if negative.any():
-        raise FormatError(
-            f"row {int(np.argmax(negative))} has a negative scale.",
-            file=path,
-            field="scale",
-            hint="give a .splat file; its scales are linear",
-        )
-    with np.errstate(divide="ignore"):  # a scale of 0 becomes the least one
-        log_scales = np.log(rows["scale"].astype(np.float64))
     quats = (rows["rotation"].astype(np.float64) - 128.0) / 128.0
     norms = np.linalg.norm(quats, axis=1, keepdims=True)
     rgba = rows["rgba"] / 255.0
+    log_scales = log_scales_of(path, rows["scale"])
     arrays = (rows["mean"], quats / np.where(norms > 0, norms, 1.0), log_scales, logit(rgba[:, 3]), dc_of(rgba[:, :3]))
     return model_of(path, SplatArrays(*(values.astype(np.float32) for values in arrays)))
 

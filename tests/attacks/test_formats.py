@@ -14,6 +14,7 @@ import torch
 
 from splatbot.errors import FormatError
 from splatbot.formats import FORMATS, load_gaussians, save_gaussians
+from splatbot.formats.ksplat import Level, save_ksplat
 from splatbot.formats.spz import Version, save_spz
 from splatbot.gaussians import GaussianModel
 from tests.unit.formats.models import detailed_model
@@ -28,9 +29,16 @@ def write_version(version: Version) -> Callable[[GaussianModel, Path], None]:
     return lambda model, path: save_spz(model, path, version)
 
 
+def write_level(level: Level) -> Callable[[GaussianModel, Path], None]:
+    """Return a writer of a level of .ksplat."""
+    return lambda model, path: save_ksplat(model, path, level)
+
+
 WRITERS: dict[str, Callable[[GaussianModel, Path], None]] = {
     "map2.spz": write_version(2),
     "map4.spz": write_version(4),
+    "map0.ksplat": write_level(0),
+    "map2.ksplat": write_level(2),
     **{f"map{entry.suffix}": save_gaussians for entry in FORMATS if entry.suffix != "_sog"},
 }
 

@@ -27,6 +27,7 @@ def source(work_folder: Path) -> Path:
         ("out.glb", 2, "lost: bookkeeping"),
         ("out.splat", 0, "lost: SH degree 2 to 0, bookkeeping; rounded: rotations, colours, opacities"),
         ("out.spz", 2, "lost: bookkeeping; rounded: positions, scales, rotations, colours, opacities, harmonics"),
+        ("out.ksplat", 2, "lost: bookkeeping; rounded: positions, scales, rotations, colours, opacities, harmonics"),
         ("out.compressed.ply", 2, "lost: bookkeeping; rounded: positions"),
         (
             "out.sbz",
@@ -74,6 +75,14 @@ def test_the_version_of_spz_is_chosen(run: RunCommand, source: Path, version: st
     assert len(load_gaussians("out.spz")) == 60
 
 
+@pytest.mark.parametrize("level", [0, 1, 2])
+def test_the_level_of_ksplat_is_chosen(run: RunCommand, source: Path, level: int) -> None:
+    answer = run("convert", source, "out.ksplat", "--ksplat-level", str(level))
+    assert Path("out.ksplat").read_bytes()[20] == level
+    assert ("rounded: colours, opacities\n" in answer.out) == (level == 0)
+    assert len(load_gaussians("out.ksplat")) == 60
+
+
 @pytest.mark.parametrize("out", ["map.ply", "sub/../map.ply", "link.ply"])
 def test_the_input_is_not_overwritten(run: RunCommand, source: Path, out: str) -> None:
     Path("link.ply").symlink_to(source)
@@ -95,6 +104,7 @@ def test_the_folder_of_a_sog_is_not_overwritten_by_itself(run: RunCommand, sourc
         (["out.spz", "--sh-degree", "5"], "--sh-degree"),
         (["out.spz", "--sh-degree", "-1"], "--sh-degree"),
         (["out.ply", "--spz-version", "3"], "--spz-version"),
+        (["out.ply", "--ksplat-level", "0"], "--ksplat-level"),
         (["folder.spz"], "OUT"),
         (["map.ply/out.spz"], "which is a file"),
     ],

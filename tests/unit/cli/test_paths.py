@@ -151,7 +151,6 @@ def test_a_file_is_recognized_by_its_suffix(tmp_path: Path, name: str, kind: str
 @pytest.mark.parametrize(
     ("name", "fix"),
     [
-        ("a.ksplat", "superspl"),
         ("a.stl", r"\.spz, \.sbz, \.sog, \.glb, \.usd"),
         ("a.gltf", r"one \.glb"),
         ("a.obj", r"\.glb"),
@@ -174,7 +173,7 @@ def test_the_folder_of_a_sog_is_a_map_and_no_recording(tmp_path: Path) -> None:
         log_kind(tmp_path)
 
 
-@pytest.mark.parametrize("name", ["a.ply", "a.spz", "a.splat", "a.sog", "a.glb"])
+@pytest.mark.parametrize("name", ["a.ply", "a.spz", "a.splat", "a.ksplat", "a.sog", "a.glb"])
 def test_a_map_given_as_a_recording_is_named(tmp_path: Path, name: str) -> None:
     (tmp_path / name).touch()
     with pytest.raises(LogError, match="splatbot info"):
