@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -19,6 +19,7 @@ from splatbot.layouts import MAP_NAME
 if TYPE_CHECKING:
     from splatbot.results.folder import RunFolder
     from splatbot.training.datasets import TrainingData
+    from splatbot.training.distributed import TrainingGroup
     from splatbot.training.folder import TrainingFolder, TrainingSettings
     from splatbot.training.session import TrainingProgress
 
@@ -41,6 +42,8 @@ def train(
     background: Literal["auto", "black", "white", "random"] = "auto",
     refine_poses: bool = False,
     antialiased: bool = False,
+    batch: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
+    processes: Annotated[int, tyro.conf.arg(metavar="N")] = 1,
     held_out_every: Annotated[int, tyro.conf.arg(metavar="K")] = 8,
     seed: int = 0,
     checkpoint_every: Annotated[float, tyro.conf.arg(metavar="S")] = 60.0,
@@ -64,6 +67,7 @@ def train(
         splatbot train scenes/fox --strategy mcmc --max-gaussians 100000
         splatbot train scenes/phone --refine-poses
         splatbot train runs/desk --minutes 5
+        splatbot train scenes/garden --processes 4
         splatbot train --resume runs/lego
         splatbot render runs/lego --video lego.mp4
 
@@ -72,7 +76,7 @@ def train(
         out: folder to write; by default runs/NAME-trained. The default for a run is RUN/training; with another folder,
             the run keeps its map.
         minutes: time to train; the schedule follows the clock, so that two runs differ.
-        iterations: steps to train, one photograph each; 7,000 unless minutes are given. Such runs repeat bit for bit.
+        iterations: steps to train; 7,000 unless minutes are given. Such runs repeat bit for bit.
         strategy: Default clones and splits Gaussians, absgrad by absolute gradients. Mcmc moves faint ones and grows to
             the cap. Fixed adds none. Auto selects fixed for a run, mcmc for photographs, default for Blender scenes.
         max_gaussians: largest number of Gaussians: quality for time and memory. By default one for each 100 pixels of
@@ -83,10 +87,14 @@ def train(
         background: behind photographs with alpha; auto is white for Blender scenes and black otherwise.
         refine_poses: correct the camera poses; held-out views are aligned to the map before they are scored.
         antialiased: compensate the low-pass filter in opacities, for views from other distances than the photographs'.
+        batch: photographs of each step; one for each process by default.
+        processes: number of processes that train together; each takes its share of the photographs of a step. For
+            several machines use torchrun (docs/guide/distributed.md).
         held_out_every: each K-th view is held out; 0 trains on all.
         seed: of the random draws.
         checkpoint_every: time between two checkpoints [s].
-        resume: continue this training; all other options are its own. Give DATASET only if it was moved.
+        resume: continue this training; all other options but processes are its own. Give DATASET only if it was
+            moved.
         overwrite: replace the training that --out holds.
         quiet: no progress and no summary, only errors.
     """
@@ -97,9 +105,11 @@ def train(
     check_output(out)
 
     from splatbot.cli.datasets import open_training_data
+    from splatbot.training.distributed import planned_group
     from splatbot.training.folder import TrainingFolder, TrainingSettings
     from splatbot.training.options import USUAL, TrainingOptions
 
+    group = planned_group(processes)
     if resume is not None:
         folder = TrainingFolder(resume)
         settings = folder.load_settings()
@@ -120,18 +130,22 @@ def train(
             refine_poses=refine_poses,
             antialiased=antialiased,
             seed=seed,
+            batch=group.size if batch is None else batch,
         )
         default = dataset / _OF_A_RUN if data.kind == "run" else Path("runs") / f"{dataset.resolve().name}-trained"
         folder = TrainingFolder(out or default)
-        folder.check_free(overwrite=overwrite)
+        if group.leads:
+            folder.check_free(overwrite=overwrite)
         settings = TrainingSettings(dataset.resolve(), scale, held_out_every, options)
-    return _train(data, folder, settings, checkpoint_every, log, resumed=resume is not None, quiet=quiet)
+    quiet = quiet or not group.leads
+    return _train(data, folder, settings, group, checkpoint_every, log, resumed=resume is not None, quiet=quiet)
 
 
 def _train(
     data: TrainingData,
     folder: TrainingFolder,
     settings: TrainingSettings,
+    group: TrainingGroup,
     checkpoint_every: float,
     log: str | None,
     *,
@@ -142,19 +156,24 @@ def _train(
     from splatbot.report.training import training_pictures
     from splatbot.results.folder import RunFolder
     from splatbot.run.interrupts import Interrupts
+    from splatbot.training.distributed import connected
     from splatbot.training.session import TrainingSession
 
     its_own = data.kind == "run" and folder.path.resolve() == (data.folder / _OF_A_RUN).resolve()
     in_place = its_own and settings.options.keeps_frame
     with Interrupts() as interrupts, _progress(quiet) as report:
-        with interrupts.interruptible():
-            start = GaussianModel.load(RunFolder(data.folder).map) if data.kind == "run" else None
-            session = TrainingSession(
-                data, folder, settings, start=start, checkpoint_s=checkpoint_every, resume=resumed
-            )
-            if not resumed:
-                folder.begin(settings)
-        session.run(report=report, stop=lambda: interrupts.requested is not None)
+        with ExitStack() as processes:
+            with interrupts.interruptible():
+                processes.enter_context(connected(group, settings, log))
+                start = GaussianModel.load(RunFolder(data.folder).map) if data.kind == "run" and group.leads else None
+                session = TrainingSession(
+                    data, folder, settings, start=start, checkpoint_s=checkpoint_every, resume=resumed, group=group
+                )
+                if not resumed and group.leads:
+                    folder.begin(settings)
+            session.run(report=report, stop=lambda: interrupts.requested is not None)
+        if not group.leads:
+            return 0
         if in_place:
             RunFolder(data.folder).replace_map(session.trainer.model)
         with interrupts.interruptible(after=int(interrupts.requested is not None)):

@@ -58,17 +58,26 @@ class ImageCache:
         Raises:
             SplatbotError: an image cannot be read.
         """
-        view = self.views[index]
-        while reduce > 1 and min(view.camera.width, view.camera.height) // reduce < _LEAST_SIDE:
-            reduce //= 2
+        reduce = self._fitting(index, reduce)
         if (index, reduce) not in self._kept:
             self._kept[index, reduce] = self._reduced(index, reduce)
         image, left_out, depth = self._kept[index, reduce]
         values = torch.from_numpy(image)
         alpha = values[..., 3].float() / 255 if image.shape[2] == 4 else None
-        camera = view.camera if reduce == 1 else view.camera.resized(image.shape[1], image.shape[0])
         trained = None if left_out is None else torch.from_numpy(~left_out)
-        return Photo(camera, values[..., :3].float() / 255, alpha, trained, depth)
+        return Photo(self.camera(index, reduce), values[..., :3].float() / 255, alpha, trained, depth)
+
+    def camera(self, index: int, reduce: int = 1) -> Camera:
+        """Return the camera of view ``index`` at 1/``reduce`` of its size, without reading the image."""
+        camera, reduce = self.views[index].camera, self._fitting(index, reduce)
+        return camera if reduce == 1 else camera.resized(camera.width // reduce, camera.height // reduce)
+
+    def _fitting(self, index: int, reduce: int) -> int:
+        """Return the largest reduction up to ``reduce`` that keeps an image large enough."""
+        camera = self.views[index].camera
+        while reduce > 1 and min(camera.width, camera.height) // reduce < _LEAST_SIDE:
+            reduce //= 2
+        return reduce
 
     def _reduced(self, index: int, reduce: int) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None, Tensor | None]:
         view = self.views[index]

@@ -40,7 +40,7 @@ class TrainingOptions:
     """Length and kind of a training. A run ends at the first of ``iterations`` and ``minutes``.
 
     Args:
-        iterations: steps of the optimizer, one image each; None for no limit.
+        iterations: steps of the optimizer; None for no limit.
         minutes: time of training, without the evaluations; None for no limit. The schedule follows the clock then, so
             that two runs differ.
         strategy: "default" (Kerbl et al. 2023), "absgrad" (Ye et al. 2024), "mcmc" (Kheradmand et al. 2024), or
@@ -59,6 +59,7 @@ class TrainingOptions:
         antialiased: render with opacities that compensate the low-pass filter (Yu et al. 2024).
         coarse_share: share of the run at half the resolution or less.
         seed: of all random draws.
+        batch: images of each step; their mean loss is minimized.
     """
 
     iterations: int | None = 7_000
@@ -76,6 +77,7 @@ class TrainingOptions:
     antialiased: bool = False
     coarse_share: float = 0.3
     seed: int = 0
+    batch: int = 1
 
     def __post_init__(self) -> None:
         if self.iterations is None and self.minutes is None:
@@ -91,6 +93,7 @@ class TrainingOptions:
             ("scale_weight", 0, 100),
             ("coarse_share", 0, 1),
             ("seed", 0, 2**31),
+            ("batch", 1, 1024),
         ):
             value = getattr(self, name)
             if value is not None and not least <= value <= most:

@@ -13,6 +13,7 @@ import numpy as np
 from splatbot.errors import InputError
 from splatbot.gaussians import GaussianModel
 from splatbot.training.datasets import TrainingData
+from splatbot.training.distributed import ALONE, TrainingGroup
 from splatbot.training.folder import ProgressRow, TrainingFolder, TrainingSettings
 from splatbot.training.images import ImageCache, check_memory
 from splatbot.training.initialize import initial_model
@@ -72,10 +73,12 @@ class TrainingSession:
         start: the Gaussians of the start; None for the points of the dataset, or random ones.
         checkpoint_s: time between two checkpoints [s].
         resume: continue from the checkpoint of the folder; without one, the training begins again.
+        group: the processes that train together; the first one's start, checkpoint, time and folder count.
 
     Raises:
         FormatError: the checkpoint is damaged.
-        InputError: the images do not fit into memory, or are not those of the checkpoint.
+        GroupError: another process of the group is gone.
+        InputError: the images do not fit into memory, or are not those of the checkpoint or of the first process.
     """
 
     def __init__(
@@ -87,31 +90,57 @@ class TrainingSession:
         start: GaussianModel | None = None,
         checkpoint_s: float = 60.0,
         resume: bool = False,
+        group: TrainingGroup = ALONE,
     ) -> None:
         self.folder = folder
+        self.group = group
         train, held_out = data.split(settings.held_out_every)
         check_memory(data)
         pixels = sum(view.camera.width * view.camera.height for view in train)
         self.options: TrainingOptions = settings.options.capped(pixels)
         self.images, self.held_out = ImageCache(train), ImageCache(held_out)
-        saved = folder.load_checkpoint() if resume and folder.checkpoint.exists() else None
+        saved = folder.load_checkpoint() if group.leads and resume and folder.checkpoint.exists() else None
         if saved is not None:
-            if saved["views"] != self._views():
-                hint = "restore the images, or train again (--overwrite)"
-                raise InputError("has other images than at the start.", file=data.folder, field="--resume", hint=hint)
+            self._check_views(saved["views"], data)
             start = GaussianModel(**saved["trainer"]["model"])
+        elif not group.leads:
+            start = GaussianModel.empty()  # until that of the first process arrives
         elif start is None:
             assert self.options.max_gaussians is not None
             start = initial_model(data, self.images, most=self.options.max_gaussians, seed=self.options.seed)
-        self.trainer = Trainer(start, self.images, self.options, data.scene_extent)
+        self.trainer = Trainer(start, self.images, self.options, data.scene_extent, group)
         self.seconds = 0.0
         self.rows: list[ProgressRow] = []
         self._checkpoint_s = checkpoint_s
         self._losses: list[float] = []
         if saved is not None:
-            self.trainer.restore(saved["trainer"])
-            self.seconds, self._losses = saved["seconds"], saved["losses"]
-            self.rows = [ProgressRow(**row) for row in saved["rows"]]
+            self._restore(saved)
+        if group.size > 1:
+            first = group.broadcast(self._state())
+            self._check_views(first["views"], data)
+            self._restore(first)
+
+    def _check_views(self, views: list[str], data: TrainingData) -> None:
+        if views != self._views():
+            hint = "restore the images, or train again (--overwrite)"
+            raise InputError("has other images than at the start.", file=data.folder, field="--resume", hint=hint)
+
+    def _state(self) -> dict[str, Any]:
+        """Return all that the rest of the run depends on."""
+        return {
+            "iteration": self.trainer.iteration,
+            "trainer": self.trainer.state(),
+            "views": self._views(),
+            "seconds": self.seconds,
+            "rows": [vars(row) for row in self.rows],
+            "losses": self._losses,
+        }
+
+    def _restore(self, state: dict[str, Any]) -> None:
+        """Go back to a :meth:`_state`."""
+        self.trainer.restore(state["trainer"])
+        self.seconds, self._losses = state["seconds"], state["losses"]
+        self.rows = [ProgressRow(**row) for row in state["rows"]]
 
     def _views(self) -> list[str]:
         """Return name and size of each training view."""
@@ -130,17 +159,22 @@ class TrainingSession:
         report: Callable[[TrainingProgress], None] = lambda progress: None,
         stop: Callable[[], bool] = lambda: False,
     ) -> None:
-        """Train, and save the checkpoint and the map.
+        """Train, and save the checkpoint and the map; of a group, the first process saves, scores and reports.
 
         Args:
             report: receives the progress some times a second.
             stop: called before each iteration; training ends once it returns True, and can be resumed.
+
+        Raises:
+            GroupError: another process of the group is gone.
         """
         saved = reported = time.monotonic()
-        while self.share < 1.0 and not stop():
+        while not self._ended(stop()):
             began = time.perf_counter()
             self._losses.append(self.trainer.step(self.share))
             self.seconds += time.perf_counter() - began
+            if not self.group.leads:
+                continue
             if self.share >= (len(self.rows) + 1) / CONSTANTS.scored_times and self.share < 1.0:
                 report(self._progress("scoring"))
                 self._note(self._some_psnr())
@@ -152,21 +186,18 @@ class TrainingSession:
                 report(self._progress("saving"))
                 self.save_checkpoint()
                 saved = time.monotonic()
-        self.save_checkpoint()
-        self.save_map()
+        if self.group.leads:
+            self.save_checkpoint()
+            self.save_map()
+
+    def _ended(self, stop: bool) -> bool:
+        """Return whether the run ends here; all processes of the group return the same."""
+        self.seconds, stop = self.group.agree(self.seconds, stop)
+        return stop or self.share >= 1.0
 
     def save_checkpoint(self) -> None:
         """Write the state of the run to the folder."""
-        self.folder.save_checkpoint(
-            {
-                "iteration": self.trainer.iteration,
-                "trainer": self.trainer.state(),
-                "views": self._views(),
-                "seconds": self.seconds,
-                "rows": [vars(row) for row in self.rows],
-                "losses": self._losses,
-            }
-        )
+        self.folder.save_checkpoint(self._state())
 
     def save_map(self) -> None:
         """Write the map and the poses of its images."""

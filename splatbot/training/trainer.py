@@ -1,10 +1,11 @@
-"""Training: Adam on all Gaussians of a scene, one photograph a step."""
+"""Training: Adam on all Gaussians of a scene, one or more photographs a step."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 from typing import Any
 
 import torch
@@ -21,6 +22,7 @@ from splatbot.optimize.surfaces import limit_normal_motion, limit_shape
 from splatbot.rasterize import rasterization
 from splatbot.rasterize.meta import RenderMeta
 from splatbot.rasterize.native import one_torch_thread
+from splatbot.training.distributed import ALONE, TrainingGroup
 from splatbot.training.images import ImageCache, Photo
 from splatbot.training.options import TrainingOptions
 from splatbot.training.poses import CameraPoses
@@ -55,6 +57,32 @@ class TrainerConstants:
 CONSTANTS = TrainerConstants()
 
 
+@dataclass(frozen=True, eq=False)
+class BatchGradients:
+    """Sums over the views of a step, from all processes.
+
+    Args:
+        loss: (1,).
+        grads: of the Gaussians' parameters by name.
+        poses: (B, 4, 4) of each view's T_camera_world, float64; None if the loss does not depend on them.
+        seen: (B, N) uint8, 1 where a Gaussian is in view.
+        centers: (B, N, 2) of the projected centres in an image of width and height 2; B is 0 if no strategy needs them.
+    """
+
+    loss: Tensor
+    grads: dict[str, Tensor]
+    poses: Tensor | None
+    seen: Tensor
+    centers: Tensor
+
+    def meta(self) -> dict[str, Any]:
+        """Return the values of a strategy as those of one packed render of all views."""
+        views, ids = self.seen[: len(self.centers)].nonzero(as_tuple=True)
+        rows = self.centers[views, ids]
+        centers = SimpleNamespace(grad=rows, absgrad=rows)
+        return {"means2d": centers, "gaussian_ids": ids, "width": 2, "height": 2, "n_cameras": 1}
+
+
 class Trainer:
     """The state of a training run. The same steps give the same bits, also across :meth:`state` and :meth:`restore`.
 
@@ -63,14 +91,23 @@ class Trainer:
         images: the training views.
         options: of the run.
         extent: of the scene [m], see :attr:`TrainingData.scene_extent`.
+        group: the processes that train together; each has a trainer of the same state.
     """
 
-    def __init__(self, model: GaussianModel, images: ImageCache, options: TrainingOptions, extent: float) -> None:
+    def __init__(
+        self,
+        model: GaussianModel,
+        images: ImageCache,
+        options: TrainingOptions,
+        extent: float,
+        group: TrainingGroup = ALONE,
+    ) -> None:
         bands = (options.sh_degree + 1) ** 2
         self.model = replace(model.clone(), sh=model.sh[:, :bands].clone())
         self.images = images
         self.options = options
         self.extent = extent
+        self.group = group
         self.iteration = 0
         self.poses = CameraPoses([view.T_world_camera for view in images.views], extent)
         self.adam = GaussianAdam(dict.fromkeys(PARAMETERS, 0.0))
@@ -107,7 +144,7 @@ class Trainer:
         self._order = state["order"]
 
     def step(self, progress: float) -> float:
-        """Run one iteration and return its loss.
+        """Run one iteration and return its mean loss.
 
         Args:
             progress: share of the run that is done, 0 to 1: rates, resolution and degree follow it.
@@ -118,52 +155,82 @@ class Trainer:
         return loss
 
     def _step(self, progress: float) -> float:
-        index = self._next_view()
-        photo = self.images.photo(index, _reduction(progress, self.options.coarse_share))
+        views = [(self._next_view(), self._background()) for _ in range(self.options.batch)]
+        reduce = _reduction(progress, self.options.coarse_share)
         scheduled = int(progress / CONSTANTS.harmonics_share * (self.options.sh_degree + 1))
         degree = max(self.model.sh_degree, min(self.options.sh_degree, scheduled))
         self.model = grow_harmonics(self.model, self.adam, degree)
         self._set_rates(progress)
+        batch = self._gradients(views, reduce, degree)
+        if batch.poses is not None:
+            for (index, _), gradient in zip(views, batch.poses, strict=True):
+                self.poses.step(index, gradient, _between(CONSTANTS.pose_rate, progress))
+        self._add_regularizers(batch.grads)
+        seen = batch.seen.bool()
+        with self._surfaces_kept([index for index, _ in views], reduce, seen):
+            self.adam.step(self.model, batch.grads, seen.any(0))
+        done = StrategyStep(self.iteration, progress, batch.meta(), self.adam, self._random)
+        self.model = self.strategy.step_post_backward(self.model, self._growth, done)
+        return float(batch.loss)
+
+    def _gradients(self, views: list[tuple[int, Tensor]], reduce: int, degree: int) -> BatchGradients:
+        """Compute the gradients of the mean loss over views and their backgrounds, each process those of its share."""
+        n, count = len(self.model), len(views)
         parameters = {name: getattr(self.model, name).requires_grad_(True) for name in PARAMETERS}
-        viewmat = self.poses.viewmats[index].clone().requires_grad_(self.options.refine_poses)
-        background = self._background()
-        render, alpha, meta = render_photo(
-            self.model,
-            photo,
-            viewmat,
-            background,
-            degree,
-            antialiased=self.options.antialiased,
-            absgrad=self.strategy.absgrad,
-        )
-        loss = self._loss(render, alpha, photo, background)
-        self.strategy.step_pre_backward(self._growth, meta)
-        loss.backward()
-        grads = {name: parameter.grad for name, parameter in parameters.items()}
+        viewmats = self.poses.viewmats[[index for index, _ in views]].requires_grad_(self.options.refine_poses)
+        loss, seen = torch.zeros(1), torch.zeros(count, n, dtype=torch.uint8)
+        centers = torch.zeros(count if self._growth else 0, n, 2)
+        for row in self.group.share(count):
+            index, background = views[row]
+            photo = self.images.photo(index, reduce)
+            render, alpha, meta = render_photo(
+                self.model,
+                photo,
+                viewmats[row],
+                background,
+                degree,
+                antialiased=self.options.antialiased,
+                absgrad=self.strategy.absgrad,
+            )
+            own = self._loss(render, alpha, photo, background)
+            self.strategy.step_pre_backward(self._growth, meta)
+            own.backward()
+            loss += own.detach()
+            seen[row] = meta["visibility"][0]
+            if self._growth:
+                gradient = meta["means2d"].absgrad if self.strategy.absgrad else meta["means2d"].grad
+                half = torch.tensor([photo.camera.width, photo.camera.height]) / 2
+                centers[row].index_copy_(0, meta["gaussian_ids"], gradient * half)
+        grads = {name: parameter.grad.contiguous() for name, parameter in parameters.items()}
         for parameter in parameters.values():
             parameter.requires_grad_(False)
             parameter.grad = None
-        if self.options.refine_poses and viewmat.grad is not None:
-            self.poses.step(index, viewmat.grad, _between(CONSTANTS.pose_rate, progress))
-        self._add_regularizers(grads)
-        with self._surfaces_kept(index, photo, meta["visible_ids"][0]):
-            self.adam.step(self.model, grads, meta["visibility"][0])
-        done = StrategyStep(self.iteration, progress, meta, self.adam, self._random)
-        self.model = self.strategy.step_post_backward(self.model, self._growth, done)
-        return float(loss.detach())
+        poses = viewmats.grad
+        self.group.sum(loss, *grads.values(), seen, centers, *(() if poses is None else (poses,)))
+        for total in (loss, *grads.values()):
+            total /= count
+        return BatchGradients(loss, grads, poses, seen, centers)
 
     @contextmanager
-    def _surfaces_kept(self, index: int, photo: Photo, rows: Tensor) -> Iterator[None]:
-        """Return a context that limits the step in its block as mapping does, if surfaces are to be kept."""
+    def _surfaces_kept(self, views: list[int], reduce: int, seen: Tensor) -> Iterator[None]:
+        """Return a context that limits the step in its block as mapping does, if surfaces are to be kept.
+
+        Args:
+            views: indices of the B views of the step.
+            reduce: factor of their size.
+            seen: (B, N) bool.
+        """
         if not self.options.keep_surfaces:
             yield
             return
+        rows = seen.any(0).nonzero()[:, 0]
         means, normals = self.model.means.index_select(0, rows), shortest_axes(self.model, rows)
         yield
         limit_normal_motion(self.model, rows, means, normals, _MAPPING.normal_step_scale)
-        viewmat, focal = self.poses.viewmats[index], photo.camera.fx
         limits = {"max_pixels": _MAPPING.max_pixels, "thickness": _MAPPING.thickness}
-        limit_shape(self.model, rows, viewmat, focal, **limits)
+        for index, of_view in zip(views, seen, strict=True):
+            viewmat, focal = self.poses.viewmats[index], self.images.camera(index, reduce).fx
+            limit_shape(self.model, of_view.nonzero()[:, 0], viewmat, focal, **limits)
 
     def _next_view(self) -> int:
         """Return the next view of a random order, in which each view comes once."""

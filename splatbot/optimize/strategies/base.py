@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,14 +20,14 @@ class StrategyStep:
     Args:
         number: of the iteration, from 0.
         progress: share of the run that is done, 0 to 1.
-        meta: of the render.
+        meta: of the render, or of all renders of the step, see :class:`RenderMeta`.
         adam: the optimizer; its moments follow the Gaussians, and its rate of the means scales the noise of MCMC.
         random: generator of the random draws.
     """
 
     number: int
     progress: float
-    meta: RenderMeta
+    meta: Mapping[str, Any]
     adam: GaussianAdam
     random: torch.Generator
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -72,7 +73,7 @@ class DefaultStrategy(Strategy):
             model = reset_opacities(model, step.adam, 2 * self.prune_opa)
         return model
 
-    def _count(self, state: dict[str, Any], meta: RenderMeta) -> None:
+    def _count(self, state: dict[str, Any], meta: Mapping[str, Any]) -> None:
         """Add the norms of the centres' gradients in an image of width and height 2."""
         centers = meta["means2d"]
         gradient = centers.absgrad if self.absgrad else centers.grad

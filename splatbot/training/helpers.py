@@ -1,0 +1,77 @@
+"""Processes that train for this one: each runs a `splatbot` command, and ends with the process that started it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from splatbot.batch.workers import usable_cores
+
+
+@dataclass(frozen=True, eq=False)
+class Helper:
+    """A process that was started.
+
+    Args:
+        name: of the process in messages.
+        process: the process.
+        output: file of the text that it prints.
+    """
+
+    name: str
+    process: subprocess.Popen[bytes]
+    output: Path
+
+    def failure(self) -> str:
+        """Return how the process failed: its error or the signal that ended it; empty while it runs or succeeded."""
+        code = self.process.poll() or 0
+        if code < 0:
+            return f"{self.name} was ended by {signal.Signals(-code).name}."
+        lines = self.output.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+        last = next((line for line in reversed(lines) if line.startswith("error: ")), f"exit code {code}.")
+        return f"{self.name}: {last.removeprefix('error: ')}" if code else ""
+
+
+Start = Callable[[str, Sequence[str], Path, Mapping[str, str]], Helper]
+"""Starts a helper: its name, the words after `splatbot`, the file of its output, and further variables."""
+
+
+@contextmanager
+def started_helpers(at_once: int) -> Iterator[Start]:
+    """Yield a function that starts helpers, which share the cores; all end with the block, or with this process.
+
+    Args:
+        at_once: number of processes that work at the same time.
+    """
+    threads = str(threads_each(at_once))
+    own = {"SPLATBOT_NUM_THREADS": threads, "OMP_NUM_THREADS": threads, "PYTHONUNBUFFERED": "1"}
+    leash, hold = os.pipe()
+    helpers: list[Helper] = []
+
+    def start(name: str, words: Sequence[str], output: Path, variables: Mapping[str, str]) -> Helper:
+        command = [sys.executable, "-P", "-m", "splatbot.batch.child", *words]
+        with output.open("wb") as file:
+            process = subprocess.Popen(
+                command, stdin=leash, stdout=file, stderr=file, env={**os.environ, **own, **variables}, process_group=0
+            )
+        helpers.append(Helper(name, process, output))
+        return helpers[-1]
+
+    try:
+        yield start
+    finally:
+        os.close(hold)
+        for helper in helpers:
+            helper.process.wait()
+        os.close(leash)
+
+
+def threads_each(at_once: int) -> int:
+    """Return the number of threads of each process that works at the same time as others."""
+    return max(1, usable_cores() // at_once)
