@@ -9,16 +9,21 @@ from typing import Any
 import torch
 from numpy.typing import ArrayLike
 
+from splatbot.collision import RobotSpheres
 from splatbot.collision.visibility import DepthView, gather_evidence
 from splatbot.errors import SplatbotError
 from splatbot.gaussians import GaussianModel, Snapshot
 from splatbot.grasping.measured import CONSTANTS as MEASURED
 from splatbot.grasping.measured import RawDepth
+from splatbot.grasping.object_list import ListedObject, list_objects
 from splatbot.grasping.sampler import GraspSampler
 from splatbot.grasping.types import GraspResult
 from splatbot.protocols import Array, RobotKinematics
 from splatbot.results.folder import RunFolder
+from splatbot.results.margin import CONSTANTS as MARGIN
+from splatbot.results.margin import AuditedError
 from splatbot.results.observers import observers
+from splatbot.results.plan_obstacles import support_tiles
 from splatbot.results.views import raw_views, subsampled_views
 from splatbot.robots.in_view import reopen_log
 from splatbot.segmentation import SegmentedMap, segment
@@ -57,6 +62,23 @@ class GraspableObjects:
         return GraspSampler(
             self.scene, robot, observers=measured.observers, views=measured.views, raw=measured.raw, **options
         )
+
+    def listed(self, robot: RobotKinematics, *, margin: float, plane: ArrayLike | None) -> tuple[ListedObject, ...]:
+        """List the objects, with reach among the obstacles of plans.
+
+        Args:
+            robot: the arm.
+            margin: clearance [m] that the links before the hand keep.
+            plane: (4,) support plane of the scene.yaml; if None, only the map is an obstacle.
+        """
+        arm = RobotSpheres(robot, T_world_base=self.scene.T_world_base)
+        tiles = None if plane is None else support_tiles(plane, arm, robot.home, margin=margin)
+        return list_objects(self.scene, robot, margin=margin, solids=tiles)
+
+    def error_around(self, error: AuditedError) -> float:
+        """Return the audited error of a map around its objects [m], 0 without objects."""
+        centers = [item.center for item in self.scene.objects]
+        return error.in_region(centers).quantile(MARGIN.confidence) if centers else 0.0
 
     def with_notes(self, result: GraspResult) -> GraspResult:
         """Add the notes of the map to a result."""

@@ -8,18 +8,28 @@ import numpy as np
 from fastapi import APIRouter, Depends, Query, Request, Response
 
 from splatbot.errors import InputError
-from splatbot.grasping.object_list import list_objects, list_planes, stroke_of
-from splatbot.services.arms import known_robot
+from splatbot.grasping.object_list import ListedObject, list_planes, stroke_of
 from splatbot.services.codecs import answer, answers
 from splatbot.services.dependencies import Served, problems
-from splatbot.services.robots_in_maps import base_in, objects_in
+from splatbot.services.margins import margin_source
+from splatbot.services.robots_in_maps import base_in, objects_in, robot_in
 
 router = APIRouter(prefix="/v1/maps", tags=["grasping"])
 
 _ANSWER = {
     "map_version": 12,
     "hand_opens_m": 0.08,
-    "planes": [{"label": "support", "height_base_m": 0.002, "size_m": [0.8, 0.6], "gaussians": 9000}],
+    "arm_margin_m": 0.006,
+    "margin_source": "audited error of the map where the arm moves",
+    "planes": [
+        {
+            "label": "support",
+            "normal_base": [0.0, 0.0, 1.0],
+            "height_base_m": 0.002,
+            "size_m": [0.8, 0.6],
+            "gaussians": 9000,
+        }
+    ],
     "objects": [
         {
             "number": 0,
@@ -31,9 +41,25 @@ _ANSWER = {
             "gaussians": 540,
             "on_support": True,
             "graspable_by_size": True,
+            "reach": "yes",
             "verdict": "fits",
             "obstacle": None,
-        }
+        },
+        {
+            "number": 1,
+            "label": "grey box 1",
+            "target": "object 1",
+            "size_m": [0.09, 0.04, 0.07],
+            "center_world_m": [0.4, 0.2, 0.9],
+            "center_base_m": [0.6, -0.3, 0.04],
+            "gaussians": 410,
+            "on_support": True,
+            "graspable_by_size": True,
+            "reach": "in collision",
+            "verdict": "in collision",
+            "obstacle": "no posture found that places the tool at its centre is free: link 4 (after panda_joint4) is "
+            "8.0 mm deep in the map or its 6.0 mm margin at (0.45, -0.20, 0.10) m from the base",
+        },
     ],
 }
 
@@ -47,14 +73,23 @@ def _robot(
 @router.get("/{map_id}/objects", response_class=Response, responses=answers(_ANSWER) | problems(404, 422, 503))
 def objects(request: Request, served: Served, robot: Annotated[str, Depends(_robot)]) -> Response:
     """List the supports and objects of a map that has a robot base; `target` names an object in POST .../grasps."""
-    arm = known_robot(robot)
+    arm = robot_in(served, robot)
     if arm.gripper is None:
         raise InputError("has no hand.", field="robot", hint="name a robot with a gripper, as panda")
-    scene = objects_in(served, np.asarray(base_in(served, None)), as_known=True).scene
+    found = objects_in(served, np.asarray(base_in(served, None)), as_known=True)
+    source = margin_source(served, None)
+    margin = source.margin if source.error is None else found.error_around(source.error)
+    plane = None if served.workspace is None else served.workspace.support_plane
+
+    def listed() -> tuple[ListedObject, ...]:
+        return found.listed(arm, margin=margin, plane=plane)
+
     body = {
         "map_version": served.map_version,
         "hand_opens_m": stroke_of(arm),
-        "planes": list_planes(scene),
-        "objects": [item.to_dict() for item in list_objects(scene, arm)],
+        "arm_margin_m": margin,
+        "margin_source": source.why,
+        "planes": list_planes(found.scene),
+        "objects": [item.to_dict() for item in served.derived.get(("listed objects", arm.name), listed)],
     }
     return answer(request, body)

@@ -52,6 +52,17 @@ def test_objects_name_their_unit_and_what_does_not_fit_the_hand(table: Service) 
         assert short <= 0.076 or "the hand opens 80 mm" in item["obstacle"]
 
 
+def test_the_documented_list_of_objects_has_the_fields_of_the_answer(table: Service) -> None:
+    body = table.client.get("/v1/maps/desk/objects").json()
+    route = table.client.get("/openapi.json").json()["paths"]["/v1/maps/{map_id}/objects"]["get"]
+    example = route["responses"]["200"]["content"]["application/json"]["example"]
+    assert example.keys() == body.keys()
+    assert example["planes"][0].keys() == body["planes"][0].keys()
+    assert example["objects"][1].keys() == body["objects"][0].keys()
+    assert {item["reach"] for item in body["objects"]} <= {"yes", "in collision", "no pose", "too far"}
+    assert (body["arm_margin_m"], body["margin_source"]) == (0.0, "unknown: the map has no recording; 0 is assumed")
+
+
 def test_distances_are_in_sigmas_and_in_metres(table: Service) -> None:
     field = table.store.get("desk").field
     points = np.array([[0.0, 0.0, 0.5], [0.0, 0.2, 0.6], [0.0, 0.0, 50.0]])

@@ -7,14 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from splatbot.bench.tabletop import Block
+from splatbot.gaussians import Snapshot
 from splatbot.grasping.advice import first_change
 from splatbot.grasping.affordance import NameHint, Target
 from splatbot.grasping.language import LanguageAffordance
 from splatbot.grasping.object_list import list_objects, list_planes, obstacle
 from splatbot.grasping.types import GraspResult
+from splatbot.robots.graspable_objects import GraspableObjects, MeasuredMap
 from splatbot.robots.panda import panda
 from splatbot.robots.store import load_robot
-from tests.unit.grasping.objects import BOX, OBJECTS, scene, target_of
+from splatbot.segmentation import segment
+from tests.unit.grasping.objects import BOX, OBJECTS, TABLE, colored, model, scene, target_of
 
 
 def test_each_object_of_the_list_can_be_named_as_a_target() -> None:
@@ -39,25 +43,75 @@ def test_an_object_beyond_the_arm_is_listed_with_its_distance() -> None:
     found = list_objects(replace(near, T_world_base=T), panda())
     fitting = [item for item in found if item.fits]
     assert fitting
-    assert all("from the first joint, and the arm reaches" in item.obstacle for item in fitting)
-    assert {item.verdict for item in fitting} == {"too far"}
-    assert not any("reaches" in item.obstacle for item in list_objects(near, panda()))
+    assert all("from the first joint, and the arm reaches" in item.to_dict()["obstacle"] for item in fitting)
+    assert {item.to_dict()["verdict"] for item in fitting} == {"too far"}
+    assert {item.reach for item in list_objects(near, panda())} == {"yes"}
 
 
 def test_reach_is_that_of_postures_and_not_of_the_size() -> None:
     near = scene()
     for item in list_objects(near, panda()):
-        assert item.within_reach
-        assert item.fits == (item.verdict == "fits")
+        assert item.reach == "yes"
+        assert item.fits == (item.to_dict()["verdict"] == "fits")
     T = near.T_world_base.copy()
     T[0, 3] -= (
         0.5  # the middle of an object is 1.0 m away: nearer than all links in line, but too far for a turned hand
     )
     far = list_objects(replace(near, T_world_base=T), panda())
-    assert not any(item.within_reach for item in far)
-    assert {item.verdict for item in far if item.fits} == {"no pose", "too far"}
+    assert {item.reach for item in far} == {"no pose", "too far"}
     assert [item.fits for item in far] == [item.fits for item in list_objects(near, panda())]
-    assert all(item.within_reach is None for item in list_objects(near, load_robot("ur5e")))  # it has no hand
+    assert all(item.reach is None for item in list_objects(near, load_robot("ur5e")))  # it has no hand
+
+
+def test_an_object_that_only_an_arm_through_the_table_reaches_is_in_collision() -> None:
+    under = np.eye(4)
+    under[:3, 3] = [0.5, 0.0, -0.75]  # below the middle of the table
+    arm, shoulder = panda(), np.array([0.5, 0.0, -0.75 + 0.333])
+    (x, y, _), (wide, deep, _) = TABLE.center, TABLE.size
+    along = np.linspace(-0.5, 0.5, 201)
+    edge = np.concatenate(
+        [
+            [(x + s * wide, y + side * deep, 0.0), (x + side * wide, y + s * deep, 0.0)]
+            for s in along
+            for side in (-0.5, 0.5)
+        ]
+    )
+    around = list_objects(segment(model(), under), arm)
+    for item in around:
+        by_the_edge = np.linalg.norm(edge - shoulder, axis=1) + np.linalg.norm(edge - item.at_world, axis=1)
+        straight = np.linalg.norm(item.at_world - shoulder)
+        assert straight < 0.7
+        if by_the_edge.min() > arm.chain.reach(arm.T_link_tcp):
+            assert item.reach == "in collision"
+            assert item.of_arm is not None
+            assert "deep in the map" in item.of_arm.reason
+    assert sum(item.reach == "in collision" for item in around) >= 2
+
+
+@pytest.mark.parametrize("robot", ["panda", "ur5e-2f85"])
+def test_a_low_object_on_the_table_is_within_reach(robot: str) -> None:
+    """The fingers of a hand at its centre would be in the table; a grasp is a little higher."""
+    low = Block((0.45, 0.10, 0.010), (0.10, 0.05, 0.020), 0.4)
+    (item,) = list_objects(segment(colored({"low": low}, 24_000, {}), np.eye(4)), load_robot(robot), margin=0.01)
+    assert item.reach == "yes"
+
+
+def test_the_links_before_the_hand_keep_the_margin() -> None:
+    (tool,) = {item.at_base[2] for item in list_objects(scene(), panda()) if item.label.startswith("red box")}
+    assert tool + 0.11 < 0.3  # the flange is 103 mm from the tool, and so less than 0.3 m above the table
+    found = list_objects(scene(), panda(), margin=0.3)
+    assert {item.reach for item in found} == {"in collision"}
+    assert all("or its 300.0 mm margin" in item.of_arm.reason for item in found if item.of_arm)
+
+
+def test_the_plane_of_the_scene_file_is_an_obstacle_where_no_frame_saw_it() -> None:
+    above = np.eye(4)
+    above[:3, 3] = [0.0, 0.0, 0.3]
+    objects = GraspableObjects(MeasuredMap(Snapshot(model(), 0)), segment(model(), above))
+    without = objects.listed(panda(), margin=0.0, plane=None)
+    assert {item.reach for item in without} == {"yes"}
+    with_plane = objects.listed(panda(), margin=0.0, plane=[0.0, 0.0, 1.0, -0.28])  # 2 cm below the base
+    assert {item.reach for item in with_plane} == {"in collision"}
 
 
 def test_planes_name_height_and_size() -> None:
