@@ -407,8 +407,12 @@ class Runtime:
             self.library.save(served)
 
     def drain(self) -> None:
-        """Begin to end: take no more work, cancel jobs, close event streams; answers under way are still given."""
+        """Begin to end: take no more work, cancel jobs, close event streams; answers under way are still given.
+
+        Searches for motions end with their best paths so far.
+        """
         self.draining = True
+        self.store.searches.stop()
         self._deadline = min(self._deadline, time.monotonic() + self.settings.shutdown_s)
         self.jobs.stop()
         self.arms.motions.stop()

@@ -21,6 +21,7 @@ from splatbot.services.derived import Derived
 from splatbot.services.frames_first import FramesFirst
 from splatbot.services.problems import MapNotReadyError
 from splatbot.services.robot_mask import RobotMask
+from splatbot.services.searches import Searches
 from splatbot.services.topics import REMOVED, STATE, TRAJECTORY, map_topic
 from splatbot.tiles import TiledMap
 from splatbot.trajectory import Trajectory
@@ -176,6 +177,7 @@ class MapStore:
         self.bus = bus or Bus()
         self._most, self._most_of_owner = most, most_of_owner
         self.frames_first = FramesFirst()
+        self.searches = Searches()
         self._lock = threading.Lock()
         self._maps: dict[str, ServedMap] = {}
         self._generations = itertools.count(1)

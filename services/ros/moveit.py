@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from splatbot.collision import RobotSpheres
 from splatbot.errors import InputError, MapNotFoundError, SplatbotError
 from splatbot.geometry import inverse
-from splatbot.planning import GaussianRRTStar, JointGoal, PlanStatus, PoseGoal
+from splatbot.planning import GaussianRRTStar, JointGoal, PlanResult, PlanStatus, PoseGoal
 from splatbot.planning.ik import solve_ik
 from splatbot.planning.timing import DEFAULT_SPEED
 from splatbot.results.margin import CONSTANTS as MARGIN
@@ -88,10 +88,15 @@ class MoveItServices:
             speed = number(request, "max_velocity_scaling_factor") or DEFAULT_SPEED
             acceleration = number(request, "max_acceleration_scaling_factor") or DEFAULT_SPEED
             around = plan_obstacles(served, robot, base, start)
+
+            def search(planner: GaussianRRTStar) -> PlanResult:
+                with self._store.searches.running(planner):
+                    return planner.plan(start, goal, budget_ms=budget)
+
             found = plan_with_margin(
                 margin_source(served, None),
                 lambda margin: GaussianRRTStar(around.field(margin), robot, T_world_base=base, margin=margin),
-                lambda planner: planner.plan(start, goal, budget_ms=budget),
+                search,
                 start,
                 goal,
                 confidence=MARGIN.confidence,

@@ -8,7 +8,7 @@ import numpy as np
 from fastapi import APIRouter, Depends, Path, Request, Response
 
 from splatbot.geometry import inverse
-from splatbot.planning import GaussianRRTStar, JointGoal, PoseGoal
+from splatbot.planning import GaussianRRTStar, JointGoal, PlanResult, PoseGoal
 from splatbot.planning.ik import solve_ik
 from splatbot.services.arms import known_robot
 from splatbot.services.codecs import answer, answers, body_of, request_body
@@ -84,10 +84,15 @@ def plan(request: Request, served: ServedAfterFrames, service: Service, query: _
     check_unknown(served, query.unknown, query.base)
     source = margin_source(served, query.margin)
     around = plan_obstacles(served, robot, base, start, policy=query.unknown, support=query.support)
+
+    def search(planner: GaussianRRTStar) -> PlanResult:
+        with service.store.searches.running(planner):
+            return planner.plan(start, goal, budget_ms=query.budget_ms, seed=query.seed)
+
     found = plan_with_margin(
         source,
         lambda margin: GaussianRRTStar(around.field(margin), robot, T_world_base=base, margin=margin),
-        lambda planner: planner.plan(start, goal, budget_ms=query.budget_ms, seed=query.seed),
+        search,
         start,
         goal,
         confidence=query.confidence,
