@@ -45,6 +45,38 @@ class Joint:
             )
 
 
+def suspect_degrees(q: Array, chain: KinematicChain, field: str) -> None:
+    """Check that joint values (J,) are not in degrees: far beyond the limits in radians, but inside in degrees.
+
+    Raises:
+        InputError: they are.
+    """
+    turning = ~chain.prismatic
+    radians = np.where(turning, np.radians(q), q)
+    beyond = turning & ((q > 2 * np.pi) | (q < -2 * np.pi)) & ((q > chain.upper) | (q < chain.lower))
+    if not beyond.any() or ((radians > chain.upper) | (radians < chain.lower)).any():
+        return
+    k = int(np.flatnonzero(beyond)[0])
+    hint = f"give radians: {' '.join(f'{value:.4g}' for value in radians)}"
+    limits = f"{chain.lower[k]:.2f} to {chain.upper[k]:.2f} rad"
+    raise InputError(f"joint {k} is {q[k]:g}, its limits are {limits}: degrees?", field=field, hint=hint)
+
+
+def check_limits(q: Array, chain: KinematicChain, field: str) -> None:
+    """Check that joint values (J,) [rad or m] are within the limits, as plans do for their ends.
+
+    Raises:
+        InputError: one is beyond its limits, or they are degrees.
+    """
+    suspect_degrees(q, chain, field)
+    beyond = chain.beyond_limits(q)
+    if beyond is not None:
+        k = beyond[0]
+        limits = f"{chain.lower[k]:.4g} to {chain.upper[k]:.4g} {'m' if chain.prismatic[k] else 'rad'}"
+        problem = f"joint {k} ({chain.names[k]}) is {q[k]:g}, its limits are {limits}."
+        raise InputError(problem, field=field, hint="give a value within them")
+
+
 def chain_of(joints: Sequence[Joint]) -> KinematicChain:
     """Return the kinematic chain of an arm's joints, from the base outwards."""
 

@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 from splatbot.collision import RobotSpheres
 from splatbot.errors import InputError
-from splatbot.planning.goals import suspect_degrees
 from splatbot.robots.graspable_objects import GraspableObjects, measured_map, segment_objects
 from splatbot.robots.joint_offsets import robot_in_scene
+from splatbot.robots.joints import suspect_degrees
 from splatbot.robots.robot import RobotModel
 from splatbot.services.arms import known_robot
 from splatbot.services.schemas import Pose

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from splatbot.frame import Frame
 
 Array = NDArray[np.float64]
+LIMIT_SLACK = 1e-6
+"""Excess [rad or m] of a joint over a limit that is no violation; encoders at a hard stop read such values."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +43,12 @@ class KinematicChain:
 
     def __len__(self) -> int:
         return len(self.names)
+
+    def beyond_limits(self, q: Array) -> tuple[int, float] | None:
+        """Return the joint of ``q`` (J,) that exceeds its limits most, and the excess [rad or m]; None within them."""
+        excess = np.maximum(self.lower - q, q - self.upper)
+        joint = int(np.argmax(excess))
+        return (joint, float(excess[joint])) if excess[joint] > LIMIT_SLACK else None
 
     def reach(self, T_link_tcp: Array) -> float:
         """Return the distance [m] from the first joint to the tool when all links are in line: an upper bound.

@@ -157,11 +157,18 @@ def grasp(
             agree_with_plans(sampler, map, arm, arm.home, unknown)
         tell(f"searching for grasps of {found.label}")
         result = objects.with_notes(sampler.sample(found, options))
+    failure = None if result.grasps else first_change(result, scene, stroke_of(arm), samples)
     folder = out if out is not None else Path("runs") / "grasp"
     folder.mkdir(parents=True, exist_ok=True)
     with atomic_write(folder / "grasp.json") as handle:
         content = grasp_file(
-            result, sampler, map_file(map), robot=arm.name, joint_offsets=arm.joint_offsets, unknown=unknown
+            result,
+            sampler,
+            map_file(map),
+            robot=arm.name,
+            joint_offsets=arm.joint_offsets,
+            unknown=unknown,
+            failure=failure,
         )
         handle.write(json.dumps(content, indent=2).encode())
     shown = next(iter((*result.grasps, *result.doubtful)), result.best_rejected)
@@ -169,8 +176,8 @@ def grasp(
         with atomic_write(folder / "grasp.png") as handle:
             hand = [part for part in appearance(arm, shown.opening) if part.link == len(arm)]
             handle.write(grasp_png(scene, found.rows, shown, hand, arm.T_link_tcp))
-    if not result.grasps and not verbose:
-        reason, change = first_change(result, scene, stroke_of(arm), samples)
+    if failure is not None and not verbose:
+        reason, change = failure
         why = " ".join(note for note in found.notes if note.startswith("took "))
         raise SplatbotError(f"cannot be grasped: {reason}. {why}".strip(), field=found.label, hint=change)
     result.unwrap()

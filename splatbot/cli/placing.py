@@ -49,6 +49,25 @@ def named_robot(name: str) -> RobotModel:
     return load_robot(name)
 
 
+def robot_of_grasps(file: Path) -> RobotModel:
+    """Return the robot of a file of grasps, before the libraries load that read the rest of it.
+
+    Raises:
+        FormatError: the file is no such file, or that of the robot is damaged.
+        InputError: no robot has that name.
+    """
+    import json
+
+    from splatbot.errors import FormatError
+
+    try:
+        name = str(json.loads(file.read_text())["robot"])
+    except (ValueError, TypeError, KeyError) as error:
+        hint = "give the grasp.json of `splatbot grasp`"
+        raise FormatError(f"is no file of grasps ({error!r}).", file=file, hint=hint) from error
+    return named_robot(name)
+
+
 def base_pose(pose: Pose | None, map_: Path) -> NDArray[np.float64]:
     """Return T_world_base (4, 4): the given one, or that of the scene.yaml next to the map.
 
@@ -151,27 +170,15 @@ def agree_with_plans(
 
 
 def joint_values(words: tuple[str, ...], robot: RobotModel, flag: str) -> NDArray[np.float64]:
-    """Parse joint values (J,) [rad or m], or "home".
+    """Parse joint values (J,) [rad or m], or "home"; commands call it before their libraries load.
 
     Raises:
-        InputError: they are no numbers, too few or too many, or degrees.
-    """
-    from splatbot.planning.goals import suspect_degrees
-
-    values = joint_numbers(words, robot, flag)
-    suspect_degrees(values, robot.chain, flag)
-    return values
-
-
-def joint_numbers(words: tuple[str, ...], robot: RobotModel, flag: str) -> NDArray[np.float64]:
-    """Parse joint values (J,) [rad or m], or "home", without the libraries that recognize degrees.
-
-    Raises:
-        InputError: they are no numbers, or too few or too many.
+        InputError: they are no numbers, too few or too many, degrees, or beyond a limit.
     """
     import numpy as np
 
     from splatbot.errors import InputError
+    from splatbot.robots.joints import check_limits
 
     if words == ("home",):
         return np.asarray(robot.home)
@@ -181,6 +188,7 @@ def joint_numbers(words: tuple[str, ...], robot: RobotModel, flag: str) -> NDArr
         raise InputError(f"is {' '.join(words)}.", field=flag, hint='give numbers, or "home"') from error
     if len(values) != len(robot) or not np.isfinite(values).all():
         raise InputError(f"has {len(values)} values.", field=flag, hint=f"{robot.name} has {len(robot)} joints")
+    check_limits(values, robot.chain, flag)
     return values
 
 

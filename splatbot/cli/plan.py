@@ -15,7 +15,6 @@ from splatbot.cli.placing import (
     base_pose,
     base_words,
     checked_pose,
-    joint_numbers,
     joint_values,
     map_obstacles,
     margin_value,
@@ -110,7 +109,7 @@ def plan(
     check_output(out)
     named = named_robot(robot)
     for words, flag in ((start, "--start"), (goal or ("home",), "--goal")):
-        joint_numbers(words, named, flag)
+        joint_values(words, named, flag)
 
     import numpy as np
 

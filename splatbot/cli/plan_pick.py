@@ -11,7 +11,7 @@ import tyro
 from splatbot.cli.drawing import CAMERA, draw_offscreen, film
 from splatbot.cli.grasp import graspable_objects
 from splatbot.cli.paths import check_file, check_output
-from splatbot.cli.placing import Pose, agree_with_plans, joint_values, pose_values
+from splatbot.cli.placing import Pose, agree_with_plans, joint_values, pose_values, robot_of_grasps
 from splatbot.errors import SplatbotError
 from splatbot.layouts import map_file
 
@@ -71,13 +71,14 @@ def plan_pick(
     check_output(video, "--video", folder=False)
     if video is not None:
         draw_offscreen()
+    named = robot_of_grasps(grasp)
+    joint_values(start, named, "--start")
 
     from splatbot.atomic import replace_files, write_text
     from splatbot.cli.progress import steps
     from splatbot.grasping.grasp_file import GraspFile
     from splatbot.grasping.pick_types import PickOptions
     from splatbot.robots.joint_offsets import robot_in_scene
-    from splatbot.robots.store import load_robot
     from splatbot.sim.map_pick import TARGET, pick_on_map, twin_of_pick
     from splatbot.sim.page import recording_html
     from splatbot.workspace import find_workspace
@@ -86,7 +87,7 @@ def plan_pick(
         lift=lift, speed=speed, slow=slow, force=force, tries=tries, budget_ms=budget_ms, attempts=1, seed=seed
     )
     known = GraspFile.load(grasp)
-    robot = robot_in_scene(load_robot(known.robot), find_workspace(map))
+    robot = robot_in_scene(named, find_workspace(map))
     known.check_offsets(robot.joint_offsets)
     grasps = known.result(grasp_index, len(robot))
     here = joint_values(start, robot, "--start")

@@ -37,6 +37,7 @@ class GraspFile:
         target: the target; its rows are those of the map without flying pixels.
         gaussians: number of rows of that map.
         grasps: grasps, best first.
+        failure: without grasps, the reason and the change to try first.
         margin, arm_margin: clearance [m] of the whole arm, and of the links before the hand.
         unknown: treatment of unknown space.
         n_sigma: surface of a Gaussian, in standard deviations.
@@ -51,6 +52,7 @@ class GraspFile:
     target: Target
     gaussians: int
     grasps: tuple[Grasp, ...]
+    failure: tuple[str, str]
     margin: float
     arm_margin: float
     unknown: UnknownPolicy
@@ -92,6 +94,7 @@ class GraspFile:
             ),
             gaussians=gaussians,
             grasps=tuple(grasp_from(grasp) for grasp in values["grasps"]),
+            failure=_failure_of(values),
             margin=float(values["margin_m"]),
             arm_margin=float(values["arm_margin_m"]),
             unknown=values["unknown_space"],
@@ -146,10 +149,14 @@ class GraspFile:
         """Return the grasp of a rank, from 0, of a robot with this number of joints.
 
         Raises:
-            InputError: there is no such grasp, or it has no joint values.
+            InputError: there is no grasp, none of this rank, or it has no joint values.
         """
+        if not self.grasps:
+            reason, change = self.failure
+            text = f"holds no grasp of {self.target.label}: {reason}."
+            raise InputError(text, file=self.path, field="grasps", hint=f"{change}; then run splatbot grasp again")
         if not 0 <= index < len(self.grasps):
-            hint = f"give 0 to {len(self.grasps) - 1}" if self.grasps else "search for grasps again"
+            hint = f"give 0 to {len(self.grasps) - 1}"
             raise InputError(f"is {index}, of {len(self.grasps)} grasps.", field="--grasp-index", hint=hint)
         found = self.grasps[index]
         q = found.q_pregrasp
@@ -173,6 +180,7 @@ def grasp_file(
     robot: str,
     joint_offsets: Sequence[float],
     unknown: UnknownPolicy,
+    failure: tuple[str, str] | None,
 ) -> dict[str, Any]:
     """Return the content of a file of grasps as JSON values.
 
@@ -183,6 +191,7 @@ def grasp_file(
         robot: name of the robot.
         joint_offsets: (J,) offsets of its joints in the scene [rad or m]; empty without them.
         unknown: treatment of unknown space.
+        failure: without grasps, the reason and the change to try first.
     """
     T = sampler.scene.T_world_base
     return summary(result) | {
@@ -197,7 +206,16 @@ def grasp_file(
         "map_sha256": sha256(map_file),
         "map_gaussians": len(sampler.scene.model),
         "target_rows": result.target.rows.tolist(),
+        "failure": None if failure is None else {"reason": failure[0], "change": failure[1]},
     }
+
+
+def _failure_of(values: Mapping[str, Any]) -> tuple[str, str]:
+    """Return the reason and the change of a search without grasps; earlier versions wrote neither."""
+    failure = values.get("failure")
+    if failure is None:
+        return "the search found none", "give another target or hand"
+    return str(failure["reason"]), str(failure["change"])
 
 
 def sha256(file: Path) -> str:

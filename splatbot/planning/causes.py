@@ -18,11 +18,9 @@ class CauseConstants:
 
     Args:
         search_distance: [m] distance around the arm in which the obstacle is searched.
-        limit_slack: [rad or m] excess of a start or goal over a limit; encoders at a hard stop read such values.
     """
 
     search_distance: float = 0.05
-    limit_slack: float = 1e-6
 
 
 CONSTANTS = CauseConstants()
@@ -30,11 +28,8 @@ CONSTANTS = CauseConstants()
 
 def limit_violation(chain: KinematicChain, q: Array) -> Cause | None:
     """Return the joint of ``q`` (J,) that exceeds its limits most, or None if all joints are within their limits."""
-    excess = np.maximum(chain.lower - q, q - chain.upper)
-    joint = int(np.argmax(excess))
-    if excess[joint] <= CONSTANTS.limit_slack:
-        return None
-    return Cause(joint=joint, depth=float(excess[joint]), name=chain.names[joint])
+    beyond = chain.beyond_limits(q)
+    return None if beyond is None else Cause(joint=beyond[0], depth=beyond[1], name=chain.names[beyond[0]])
 
 
 def collision(arm: RobotSpheres, field: GaussianCollisionField, q: Array) -> Cause:

@@ -9,13 +9,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from splatbot.collision import GaussianCollisionField, RobotSpheres
-from splatbot.errors import InputError
 from splatbot.geometry import so3_exp
 from splatbot.planning.causes import collision, limit_violation
 from splatbot.planning.ik import CONSTANTS as IK
 from splatbot.planning.ik import HasTool, inverse_kinematics, is_rigid, nearest_turns
 from splatbot.planning.problem import Cause, Goal, GoalError, JointGoal, PlanStatus, PoseGoal
-from splatbot.protocols import Array, KinematicChain
+from splatbot.protocols import Array
 
 
 @dataclass(frozen=True)
@@ -39,23 +38,6 @@ class GoalConstants:
 
 
 CONSTANTS = GoalConstants()
-
-
-def suspect_degrees(q: Array, chain: KinematicChain, field: str) -> None:
-    """Check that joint values (J,) are not in degrees: far beyond the limits in radians, but inside in degrees.
-
-    Raises:
-        InputError: they are.
-    """
-    turning = ~chain.prismatic
-    radians = np.where(turning, np.radians(q), q)
-    beyond = turning & ((q > 2 * np.pi) | (q < -2 * np.pi)) & ((q > chain.upper) | (q < chain.lower))
-    if not beyond.any() or ((radians > chain.upper) | (radians < chain.lower)).any():
-        return
-    k = int(np.flatnonzero(beyond)[0])
-    hint = f"give radians: {' '.join(f'{value:.4g}' for value in radians)}"
-    limits = f"{chain.lower[k]:.2f} to {chain.upper[k]:.2f} rad"
-    raise InputError(f"joint {k} is {q[k]:g}, its limits are {limits}: degrees?", field=field, hint=hint)
 
 
 @dataclass(frozen=True, eq=False)

@@ -50,7 +50,7 @@ def test_the_pregrasp_of_a_grasp_is_a_goal(run: RunCommand, map_file: Path, tmp_
         ({"grasps": None}, 0, "is no file of grasps"),
         ({"grasps": [{}]}, 0, "is no file of grasps"),
         ({"T_world_base": {"translation": [0, 0]}}, 0, "is no file of grasps"),
-        ({"grasps": []}, 0, "--grasp-index: is 0, of 0 grasps"),
+        ({"grasps": []}, 0, "grasps: holds no grasp of red box: the search found none"),
         ({"grasps": [grasp_values((0.0,))]}, 0, "has no joint values"),
         ({"grasps": [grasp_values(None)]}, 0, "has no joint values"),
         ({"grasps": [grasp_values((0, 0, 0, float("nan"), 0, 0, 0))]}, 0, "has no joint values"),

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +16,8 @@ from splatbot.collision import RobotSpheres
 from splatbot.robots.panda import panda
 from splatbot.sim.motion import load_motion
 from splatbot.workspace import Workspace
-from tests.unit.cli.conftest import RunCommand, assert_refused
+from tests.unit.cli.conftest import RunCommand, assert_fix_named, assert_refused
+from tests.unit.grasping.files import grasp_file_values
 from tests.unit.grasping.objects import OBJECTS, model
 
 pytest.importorskip("mujoco")
@@ -127,6 +130,44 @@ def test_grasps_have_the_ranks_of_the_table_and_of_grasp_index(
 def test_a_rank_that_does_not_exist_is_refused(run: RunCommand, map_file: Path, grasps: Path) -> None:
     words = ("--map", map_file, "--grasp", grasps, "--grasp-index", 7)
     assert_refused(run("plan-pick", *words), "--grasp-index: is 7, of 3 grasps")
+
+
+@pytest.mark.parametrize(
+    ("start", "mistake"),
+    [
+        ("0 1 0", "--start: has 3 values. Fix: panda has 7 joints"),
+        ("0 -45 0 -135 0 90 45", "its limits are -1.76 to 1.76 rad: degrees?"),
+        ("0 -0.785 0 -2.356 0 1.571 2.95", "joint 6 (panda_joint7) is 2.95, its limits are -2.897 to 2.897 rad"),
+        ("here", "--start: is here. Fix: give numbers"),
+    ],
+)
+def test_a_wrong_start_is_named_before_libraries_load(tmp_path: Path, start: str, mistake: str) -> None:
+    """The limits are those of the data sheet: ±1.7628 rad and ±2.8973 rad."""
+    for name in ("map.ply", "grasp.json"):
+        (tmp_path / name).write_text(json.dumps(grasp_file_values()))
+    words = ["plan-pick", "--map", "map.ply", "--grasp", "grasp.json", "--start", *start.split()]
+    heavy = ("torch", "cv2", "mujoco", "scipy")
+    program = (
+        f"import sys\nfrom splatbot.cli import main\nprint(main({words!r}), [m for m in {heavy!r} if m in sys.modules])"
+    )
+    answer = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=True, timeout=120
+    )
+    assert answer.stdout == "2 []\n"
+    assert mistake in answer.stderr
+
+
+def test_a_search_without_grasps_is_refused_with_its_reason_and_change(
+    run: RunCommand, map_file: Path, tmp_path: Path
+) -> None:
+    """The green box is 120 mm wide, and the hand opens 80 mm."""
+    out = tmp_path / "grasp"
+    assert run("grasp", "--map", map_file, "--target", "green box", "--out", out).code == 1
+    for command in (("plan-pick",), ("plan-pick", "--grasp-index", 1), ("plan", "--start", "home")):
+        answer = run(*command, "--map", map_file, "--grasp", out / "grasp.json", "--out", tmp_path / "out")
+        assert_refused(answer, "grasp.json: grasps: holds no grasp of green box: its faces are 120 mm apart")
+        assert_fix_named(answer, "take a hand that opens wider")
+        assert "--grasp-index" not in answer.err
 
 
 def test_grasps_of_an_earlier_calibration_are_refused_by_plans_and_picks(
