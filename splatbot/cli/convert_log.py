@@ -137,8 +137,9 @@ def _write_tum(source: Log, out: Path, depth_scale: float | None, progress: Call
             yield frame
 
     with _whole(out) as draft:
-        record(images(), draft, ground_truth=source.ground_truth, depth_scale=scale, progress=progress)
+        sensor = source.calibration.sensor
+        record(
+            images(), draft, ground_truth=source.ground_truth, depth_scale=scale, sensor=sensor, progress=progress
+        )
     if masked:
         print_message("warning", f"the masks of {masked} frames are not written; an .mcap file holds them")
-    if source.calibration.sensor:
-        print_message("warning", "the calibration of the sensor is not written; give it by --camera FILE")

@@ -55,6 +55,22 @@ class SensorConfig(_Section):
     depth_scale: float = Field(default=1.0, gt=0, description="factor on the measured depth")
     depth_bias: float = Field(default=0.0, description="added to the measured depth, after the factor [m]")
     exposure: float = Field(default=0.0, ge=0, le=0.2, description="exposure time of colour: motion blur [s]")
+    stamp_sigma: float = Field(
+        default=5e-3, ge=0, le=0.2, description="standard deviation of the stamps: latency and jitter [s]"
+    )
+    image_sigma: float = Field(
+        default=0.25,
+        ge=0,
+        le=20,
+        description="standard deviation of image points by the models of lens and shutter and the registration of "
+        "depth [px]",
+    )
+    calibration_error: float = Field(
+        default=3e-3,
+        ge=0,
+        le=0.2,
+        description="relative error of the focal length and of depth, which accumulates along a path",
+    )
     depth_sigma_scale: float = Field(
         default=10.0,
         ge=1,

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +12,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from splatbot.atomic import atomic_write
 from splatbot.errors import LogError
 from splatbot.frame import Frame
-from splatbot.logs.base import Log
+from splatbot.logs.base import Log, LogBase
+from splatbot.logs.calibration import Calibration, save_calibration
 from splatbot.logs.joints import NAME as JOINTS
 from splatbot.logs.joints import joint_header
 from splatbot.trajectory import Trajectory
@@ -32,6 +31,7 @@ def record(
     *,
     ground_truth: Trajectory | None = None,
     depth_scale: float = 5000.0,
+    sensor: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
 ) -> Path:
     """Write colour as PNG, depth as 16-bit PNG, stamps, intrinsics, poses and, if available, joints.
@@ -45,6 +45,8 @@ def record(
         ground_truth: reference poses T_world_camera. If None, those of ``frames`` are used if it is a log with a
             reference.
         depth_scale: units per metre; depth beyond 65535 units is written as missing, and logged.
+        sensor: values of the section `sensor` of the configuration. If None, those of ``frames`` are used if it is a
+            log.
         progress: called with the number of frames written so far.
 
     Returns:
@@ -57,6 +59,8 @@ def record(
     if (out / "rgb.txt").exists():
         raise LogError("holds a recording already.", file=out, field="rgb.txt", hint="choose another folder")
     truth = ground_truth if ground_truth is not None else getattr(frames, "ground_truth", None)
+    if sensor is None:
+        sensor = frames.calibration.sensor if isinstance(frames, LogBase) else {}
     for part in ("rgb", "depth"):
         (out / part).mkdir(parents=True, exist_ok=True)
     if truth is not None:
@@ -68,7 +72,7 @@ def record(
         for number, frame in enumerate(frames):
             if camera is None:
                 camera = frame.camera
-                _write_intrinsics(out, frame, depth_scale)
+                save_calibration(Calibration(camera, depth_scale, sensor=sensor), out / "intrinsics.json")
             elif frame.camera != camera:
                 raise LogError("the camera changed.", file=frame.source, field="camera", hint="record two logs")
             name = f"{number:06d}.png"
@@ -152,10 +156,3 @@ def _write_png(path: Path, image: NDArray[Any]) -> None:
     if not ok:
         raise LogError("could not be encoded.", file=path, field="image", hint="report this image as a bug")
     path.write_bytes(data.tobytes())
-
-
-def _write_intrinsics(out: Path, frame: Frame, depth_scale: float) -> None:
-    camera = frame.camera
-    values = {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "width", "height")}
-    with atomic_write(out / "intrinsics.json") as file:
-        file.write(json.dumps(values | {"depth_scale": depth_scale}, indent=1).encode())

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from splatbot.camera import Camera
 from splatbot.errors import InputError, LogError
 from splatbot.frame import Frame
-from splatbot.logs.base import StampedLog
+from splatbot.logs.base import MILLIMETRES, StampedLog
+from splatbot.logs.calibration import Calibration
 from splatbot.logs.effects import Account, FrameEffects, make_effects
 from splatbot.logs.scenes import SCENES, RaycastScene, SceneKind
 from splatbot.logs.trajectories import MotionOptions, make_path
@@ -61,6 +62,9 @@ _BOUNDS: dict[str, tuple[float, float]] = {
 }
 
 
+_EXACT = {"stamp_sigma": 0.0, "image_sigma": 0.0, "calibration_error": 0.07e-3}
+
+
 class SyntheticLog(StampedLog):
     """Frames of a scene, rendered on access without a cache; equal values of ``uri`` give bit-identical frames.
 
@@ -93,6 +97,11 @@ class SyntheticLog(StampedLog):
         """An ideal pinhole camera."""
         f, w, h = 525.0 * self.options.width / 640.0, self.options.width, self.options.height
         return Camera(f, f, (w - 1) / 2, (h - 1) / 2, w, h)
+
+    @property
+    def calibration(self) -> Calibration:
+        """The camera, and a sensor whose calibration is exact but for the rounding of images."""
+        return Calibration(self.camera, MILLIMETRES, sensor=_EXACT)
 
     ground_truth: Trajectory
     """Exact poses T_world_camera of all recorded frames; z is up."""

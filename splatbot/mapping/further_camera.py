@@ -20,7 +20,6 @@ from splatbot.tracking.features import Features, match_pose
 from splatbot.tracking.nearby_keyframes import is_within, pose_distance
 from splatbot.tracking.prepare import PreparedFrame, prepare, typical_depth
 from splatbot.tracking.tracker import Tracker
-from splatbot.tracking.uncertainty import Uncertainty
 
 Array = NDArray[np.float64]
 
@@ -124,7 +123,7 @@ class MountedCamera:
             self.anchor = (state.first_keyframes if self.pose.is_exact else near)[0].number
         A = adjoint(inverse(self.pose.T_parent_camera))
         covariance = self.pose.covariance + A @ parent.covariance @ A.T
-        return PoseEstimate(T, "ok", (), "extrinsics", Uncertainty(covariance))
+        return PoseEstimate(T, "ok", (), "extrinsics", covariance=covariance)
 
     def keypoints(self, prepared: PreparedFrame, estimate: PoseEstimate) -> Callable[[], Features]:
         """Return a function without keypoints: no frame is matched with those of a mounted camera."""

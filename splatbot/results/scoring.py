@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,7 @@ from splatbot.evaluation import (
     ssim,
 )
 from splatbot.gaussians import GaussianModel
-from splatbot.geometry import transform_points
+from splatbot.geometry import se3_log, transform_points
 from splatbot.logs import Log
 from splatbot.rasterize.views import colorize, render_view
 from splatbot.trajectory import Trajectory
@@ -37,7 +38,9 @@ class TrajectoryScore:
     Args:
         absolute: ATE, with the M associated frames.
         relative: RPE; None with fewer than two of them.
-        consistency: NEES; None with fewer than two of them, or where covariances are not known.
+        consistency: NEES with the camera's fitted pose on the body of the reference; None with fewer than two of them,
+            or where covariances are not known.
+        consistency_as_given: NEES with the reference as it is.
         estimate: (M, 3) [m] their camera centres, aligned to the reference.
         reference: (K, 3) [m] camera centres of the reference over the time of the run.
     """
@@ -45,6 +48,7 @@ class TrajectoryScore:
     absolute: AbsoluteError
     relative: RelativeError | None
     consistency: Consistency | None
+    consistency_as_given: Consistency | None
     estimate: NDArray[np.float64]
     reference: NDArray[np.float64]
 
@@ -77,10 +81,12 @@ def score_trajectory(
     associated = np.isin(estimate.stamps, absolute.stamps)
     during = (reference.stamps >= estimate.stamps[0] - 0.1) & (reference.stamps <= estimate.stamps[-1] + 0.1)
     several = len(absolute.errors) > 1
+    normalized = partial(nees, reference, estimate, covariances) if several and covariances is not None else None
     return TrajectoryScore(
         absolute=absolute,
         relative=relative_error(reference, estimate) if several else None,
-        consistency=nees(reference, estimate, covariances) if several and covariances is not None else None,
+        consistency=normalized(fit_mount=True) if normalized else None,
+        consistency_as_given=normalized() if normalized else None,
         estimate=transform_points(absolute.T_reference_estimate, estimate.positions[associated]),
         reference=reference.positions[during],
     )
@@ -89,6 +95,9 @@ def score_trajectory(
 def trajectory_metrics(score: TrajectoryScore | None) -> dict[str, float | None]:
     """Return the trajectory's part of ``metrics.json``, with None for each value without a reference."""
     relative = score.relative if score else None
+    fitted = score.consistency if score else None
+    given = score.consistency_as_given if score else None
+    mount = se3_log(fitted.T_reference_camera) if fitted else None
     return {
         "ate_rmse_m": score.absolute.rmse if score else None,
         "ate_mean_m": score.absolute.mean if score else None,
@@ -97,7 +106,10 @@ def trajectory_metrics(score: TrajectoryScore | None) -> dict[str, float | None]
         "reference_scale": score.reference_scale if score else None,
         "ate_frames": len(score.absolute.errors) if score else 0,
         "rpe_trans_rmse_m": relative.trans_rmse if relative else None,
-        "nees": score.consistency.mean if score and score.consistency else None,
+        "nees": fitted.mean if fitted else None,
+        "nees_as_given": given.mean if given else None,
+        "reference_mount_m": float(np.linalg.norm(mount[:3])) if mount is not None else None,
+        "reference_mount_deg": float(np.rad2deg(np.linalg.norm(mount[3:]))) if mount is not None else None,
         "rpe_rot_rmse_deg": float(np.rad2deg(relative.rot_rmse)) if relative else None,
     }
 

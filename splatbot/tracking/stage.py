@@ -21,9 +21,10 @@ from splatbot.tracking.features import FeaturePose, Features
 from splatbot.tracking.hypothesis import Hypothesis, ScoredHypothesis
 from splatbot.tracking.motion_model import Prediction
 from splatbot.tracking.nearby_keyframes import TrackedKeyframe, nearest, order_by_distance
-from splatbot.tracking.prepare import PreparedFrame
+from splatbot.tracking.prepare import PreparedFrame, typical_depth
 from splatbot.tracking.rectify import moved_pixels
 from splatbot.tracking.relocalization import PlaceSearch
+from splatbot.tracking.uncertainty import CalibratedView
 
 Array = NDArray[np.float64]
 
@@ -112,6 +113,10 @@ class TrackingProblem:
             pixels = moved_pixels(self.matches.pixels, points, prepared.frame.camera, change, readout)
             self.matches = replace(self.matches, pixels=pixels)
         self.prepared, self.features = prepared, None
+
+    def calibrated_view(self, twist: Array) -> CalibratedView:
+        """Return the frame's quantities for errors of calibration, at a velocity (6,) [m/s, rad/s] of the camera."""
+        return CalibratedView(self.config.sensor, twist, typical_depth(self.prepared), self.prepared.frame.camera.fx)
 
     def hypothesis(self, stage: str, T_world_camera: Array) -> Hypothesis:
         """Return a hypothesis at a pose (4, 4), to be aligned to the keyframes nearest to it."""

@@ -79,18 +79,18 @@ class Tracker:
 
     def track(self, prepared: PreparedFrame, keyframes: Sequence[TrackedKeyframe]) -> PoseEstimate:
         """Estimate the pose of a frame; the verdict is "lost" if no hypothesis explains it."""
-        motion_prior, robot_prior = self._predict(prepared.frame)
-        T_last, search = self.motion.T_world_camera, self._search
+        frame, T_last, search = prepared.frame, self.motion.T_world_camera, self._search
+        motion_prior, robot_prior = self._predict(frame)
         problem = TrackingProblem(self.config, prepared, keyframes, self._lost, T_last, search)
         scheduler = StageScheduler(problem, self._stages, self._costs)
         best = scheduler.best_hypothesis(robot_prior or motion_prior)
-        best, trusted_prior = self._check_robot_prior(best, robot_prior, motion_prior, scheduler)
+        best, trusted_prior = self._check_robot_prior(best, robot_prior, motion_prior, problem, scheduler)
         best = self._rectify_again(best, problem, scheduler)
         pose, uncertainty = self._fuse_prior(best, trusted_prior, motion_prior)
-        pose = self._confirm_relocalization(prepared.frame.stamp, pose)
+        pose = self._confirm_relocalization(frame.stamp, pose)
         pose, uncertainty = self._filter_motion(pose, uncertainty, best, problem.prepared, trusted_prior)
-        self._update(prepared.frame.stamp, pose, robot_prior)
-        return PoseEstimate.create(pose, uncertainty, problem, scheduler.budget)
+        self._update(frame.stamp, pose, robot_prior)
+        return PoseEstimate.create(pose, uncertainty, problem, scheduler.budget, self._filter.twist_at(frame.stamp))
 
     @property
     def is_lost(self) -> bool:
@@ -163,12 +163,14 @@ class Tracker:
         best: ScoredHypothesis,
         robot_prior: Prediction | None,
         motion_prior: Prediction,
+        problem: TrackingProblem,
         scheduler: StageScheduler,
     ) -> tuple[ScoredHypothesis, Prediction | None]:
         """Reject a robot prior that contradicts the frame, and search again from the motion prior without it."""
         if robot_prior is None:
             return best, None
-        covariance = self._uncertainty(best).covariance if robot_prior.absolute else best.covariance
+        view = problem.calibrated_view(self.expected_twist(problem.prepared.frame.stamp))
+        covariance = self._uncertainty(best).covariance(view) if robot_prior.absolute else best.covariance
         distance = mahalanobis_distance(best, robot_prior, covariance) if best.verdict != "lost" else np.inf
         if is_consistent(distance):
             return best, robot_prior

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from splatbot.config import SensorConfig
 from splatbot.geometry import adjoint, inverse, so3_log
 from splatbot.tracking.align import Alignment
 
@@ -25,12 +26,26 @@ class UncertaintyConstants:
     the spread between them does not contain it."""
     cell_correlation: float = 1.25
     """Factor [1] on the spread, because the errors of adjacent cells are correlated."""
-    calibration: float = 0.07e-3
-    """Relative error [1] of the calibration of lens and depth. It is the same in all frames, so it accumulates along a
-    path and does not average out."""
 
 
 CONSTANTS = UncertaintyConstants()
+
+
+@dataclass(frozen=True, eq=False)
+class CalibratedView:
+    """Quantities of a frame by which errors of calibration become errors of its pose.
+
+    Args:
+        sensor: ``stamp_sigma`` [s], ``image_sigma`` [px] and ``calibration_error`` [1].
+        twist: (6,) velocity [m/s, rad/s] of the camera in its own frame.
+        depth: typical depth [m].
+        focal: focal length [px].
+    """
+
+    sensor: SensorConfig
+    twist: Array
+    depth: float
+    focal: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,12 +63,21 @@ class Uncertainty:
     moved: float = 0.0
     turned: float = 0.0
 
-    @property
-    def covariance(self) -> Array:
-        """Covariance (6, 6) of the same twist with the error of calibration."""
-        shift = (CONSTANTS.calibration * self.moved) ** 2 / 3
-        turn = (CONSTANTS.calibration * self.turned) ** 2 / 3
-        return self.random + np.diag([shift] * 3 + [turn] * 3)
+    def covariance(self, view: CalibratedView) -> Array:
+        """Return the covariance (6, 6) of the same twist with the errors of calibration, which do not average out.
+
+        With the length l and the angle α of the chain, the relative error c, the velocity ϖ of the camera, the depth z
+        and the focal length f::
+
+            C = Σ_random + σ_stamp² ϖ ϖᵀ + diag(a, a, a, b, b, b)
+            a = (c l)² / 3 + (σ_image z / f)²
+            b = (c α)² / 3 + (σ_image / f)²
+        """
+        sensor = view.sensor
+        shift = (sensor.calibration_error * self.moved) ** 2 / 3 + (sensor.image_sigma * view.depth / view.focal) ** 2
+        turn = (sensor.calibration_error * self.turned) ** 2 / 3 + (sensor.image_sigma / view.focal) ** 2
+        along_motion = sensor.stamp_sigma**2 * np.outer(view.twist, view.twist)
+        return self.random + along_motion + np.diag([shift] * 3 + [turn] * 3)
 
 
 def alignment_covariance(alignment: Alignment) -> Array:

@@ -20,7 +20,7 @@ from splatbot.bench.tracking.stress import (
     run_case,
     run_stress,
 )
-from splatbot.config import Config, load_config
+from splatbot.config import Config, load_config, with_sensor
 from splatbot.evaluation import nees
 from splatbot.logs import open_log
 from splatbot.slam import Slam
@@ -115,7 +115,7 @@ def test_poses_around_a_wall_of_soft_colours_err_no_more_than_they_say() -> None
 
 def nees_of(log: str, config: Config, width: int = WIDTH) -> float:
     source = open_log(f"synthetic:{log}&width={width}&height={width * 3 // 4}")
-    slam = Slam(config)
+    slam = Slam(with_sensor(config, source.calibration.sensor))
     results = [slam.process(source[i]) for i in range(len(source))]
     assert source.ground_truth is not None
     poses = np.array([r.T_world_camera for r in results])

@@ -7,7 +7,7 @@ import pytest
 
 from splatbot.errors import InputError
 from splatbot.evaluation import nees
-from splatbot.geometry import se3_exp
+from splatbot.geometry import inverse, se3_exp, se3_log
 from splatbot.trajectory import Trajectory
 
 SIGMAS = np.array([1e-3, 2e-3, 3e-3, 1e-3, 2e-3, 5e-4])
@@ -40,6 +40,44 @@ def test_errors_of_the_reference_itself_are_taken_into_account() -> None:
     assert nees(reference, estimate, covariances, reference_covariance=3 * np.diag(SIGMAS**2)).mean == pytest.approx(
         1.0, abs=0.05
     )
+
+
+def test_a_camera_that_sits_askew_on_the_tracked_body_is_fitted() -> None:
+    rng, t = np.random.default_rng(4), np.arange(400) / 30
+    turns = [0.5 * np.sin(t), 0.4 * np.sin(1.7 * t), 0.6 * np.sin(0.6 * t)]
+    truth = np.array([se3_exp(twist) for twist in np.stack([0.1 * t, 0 * t, 0 * t, *turns], axis=1)])
+    poses = np.array([T @ se3_exp(-SIGMAS * rng.standard_normal(6)) for T in truth])
+    T_reference_camera = se3_exp([0.01, -0.005, 0.02, 0.02, -0.01, 0.015])
+    body, estimate = Trajectory(t, truth @ inverse(T_reference_camera)), Trajectory(t, poses)
+    covariances = np.tile(np.diag(SIGMAS**2), (400, 1, 1))
+    assert nees(body, estimate, covariances).mean > 10
+    found = nees(body, estimate, covariances, fit_mount=True)
+    assert found.mean == pytest.approx(1.0, abs=0.1)
+    np.testing.assert_allclose(found.T_reference_camera, T_reference_camera, atol=1e-3)
+
+
+def test_a_motion_without_rotation_leaves_the_mount_as_it_is() -> None:
+    """Any mount explains it, so the prior decides."""
+    rng, stamps = np.random.default_rng(5), np.arange(300) / 30
+    truth = np.array([se3_exp([0.01 * i, 0, 0, 0, 0, 0]) for i in range(300)])
+    poses = np.array([T @ se3_exp(-SIGMAS * rng.standard_normal(6)) for T in truth])
+    covariances = np.tile(np.diag(SIGMAS**2), (300, 1, 1))
+    found = nees(Trajectory(stamps, truth), Trajectory(stamps, poses), covariances, fit_mount=True)
+    assert np.linalg.norm(se3_log(found.T_reference_camera)) < 5e-3
+    assert found.mean == pytest.approx(1.0, abs=0.1)
+
+
+def test_a_reference_at_other_times_is_interpolated() -> None:
+    """At 60 deg/s, the nearest of 100 poses a second is up to 0.3 degrees off."""
+
+    def pose(t: float) -> np.ndarray:
+        return se3_exp([0.3 * t, 0, 0, 0, 1.05 * t, 0])
+
+    dense, stamps = np.arange(0, 5, 0.01), np.arange(0.0137, 4.9, 1 / 30)
+    reference = Trajectory(dense, np.array([pose(t) for t in dense]))
+    estimate = Trajectory(stamps, np.array([pose(t) for t in stamps]))
+    covariances = np.tile(1e-10 * np.eye(6), (len(stamps), 1, 1))
+    assert nees(reference, estimate, covariances).values.max() < 1e-6
 
 
 def test_covariances_that_cannot_be_are_refused() -> None:

@@ -6,13 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import ArrayLike
 
 from splatbot.config import SensorConfig, TrackingConfig
 from splatbot.geometry import inverse, se3_exp, se3_log
 from splatbot.tracking.align import Alignment, align
 from splatbot.tracking.prepare import Level, prepare
 from splatbot.tracking.reference import make_reference
-from splatbot.tracking.uncertainty import Uncertainty, alignment_covariance, world_uncertainty
+from splatbot.tracking.uncertainty import CalibratedView, Uncertainty, alignment_covariance, world_uncertainty
 from tests.rgbd import CAMERA, Array, rays_of, tabletop, wall_depth, wall_frame
 
 CONFIG = TrackingConfig(n_pixels=2000)
@@ -125,7 +126,36 @@ def test_the_covariance_grows_with_the_length_of_the_chain() -> None:
     for _ in range(10):
         before, T = T, T @ step
         known = world_uncertainty(T, np.diag([1e-6] * 6), [(before, known)])
-        sizes.append(np.trace(known.covariance[:3, :3]))
+        sizes.append(np.trace(known.covariance(view())[:3, :3]))
     assert (np.diff(sizes) > 0).all()
     assert known.moved == pytest.approx(10 * np.linalg.norm(step[:3, 3]))
     assert known.turned == pytest.approx(1.0)
+
+
+def view(twist: ArrayLike = (0.0,) * 6, **sensor: float) -> CalibratedView:
+    """Return a view at 2 m with a focal length of 500 px, and no error of calibration but those of ``sensor``."""
+    exact = {"stamp_sigma": 0.0, "image_sigma": 0.0, "calibration_error": 0.0}
+    return CalibratedView(SensorConfig(**(exact | sensor)), np.asarray(twist, np.float64), 2.0, 500.0)
+
+
+def test_a_wrong_stamp_is_an_error_along_the_motion() -> None:
+    """Against 20,000 poses of the same motion at random times."""
+    twist, rng = np.array([0.3, -0.1, 0.2, 0.5, 1.0, -0.4]), np.random.default_rng(3)
+    errors = np.array([se3_log(se3_exp(dt * twist)) for dt in rng.normal(0, 0.01, 20_000)])
+    found = Uncertainty().covariance(view(twist, stamp_sigma=0.01))
+    np.testing.assert_allclose(found, np.cov(errors.T), atol=0.03 * found.max())
+
+
+def test_a_displaced_image_is_an_error_of_position_or_of_rotation() -> None:
+    """A point at 2 m moves by a pixel if the camera moves by the standard deviation or turns by it."""
+    moved, *_, turned = np.sqrt(np.diag(Uncertainty().covariance(view(image_sigma=1.0))))
+    point = np.array([0.0, 0.0, 2.0, 1.0])
+    for twist in ([moved, 0, 0, 0, 0, 0], [0, 0, 0, 0, turned, 0]):
+        x, _, z, _ = inverse(se3_exp(twist)) @ point
+        assert abs(500 * x / z) == pytest.approx(1.0, rel=1e-5)
+
+
+def test_a_wrong_focal_length_accumulates_along_the_path() -> None:
+    known = Uncertainty(moved=2.0, turned=0.5)
+    deviations = np.sqrt(np.diag(known.covariance(view(calibration_error=0.01))))
+    np.testing.assert_allclose(deviations, [0.02 / np.sqrt(3)] * 3 + [0.005 / np.sqrt(3)] * 3)
