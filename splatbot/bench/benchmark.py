@@ -43,6 +43,7 @@ BENCHMARKS = {
     "grasping": Entry("splatbot.bench.grasping", "Measure grasping: candidates per second, errors of the contacts."),
     "logs": Entry("splatbot.bench.logs", "Measure the reading of logs: frames per second of each layout."),
     "service": Entry("splatbot.bench.service", "Measure the service: mapping under queries, and the cost of HTTP."),
+    "sizing": Entry("splatbot.bench.sizing", "Measure costs of the service; plan and simulate a fleet from them."),
 }
 
 

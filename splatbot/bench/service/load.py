@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
 import tempfile
 import time
 from collections.abc import Sequence
@@ -17,6 +15,7 @@ from splatbot.bench.machine import describe_machine
 from splatbot.bench.results import Results
 from splatbot.bench.service import ServiceBenchSettings
 from splatbot.bench.service.clients import QueryLoad, QueryOutcome, running_clients
+from splatbot.bench.service.process import cpu_seconds, resident_mib
 from splatbot.bench.timing import measure
 from splatbot.client import Client
 from splatbot.collision import GaussianCollisionField
@@ -48,10 +47,10 @@ def run_service_bench(settings: ServiceBenchSettings, report_progress: ReportPro
         stamps = _Stamps(frames, settings.rate)
         report_progress("mapping the whole scene")
         _push(service, client, stamps, min(2 * (len(frames) - 1) / settings.rate, settings.seconds))
-        before = _resident(service.process)
+        before = resident_mib(service.process)
         _measure_mapping(results, service, client, stamps, settings, report_progress)
         results.add("service", "memory before", before, "MiB")
-        results.add("service", "memory after", _resident(service.process), "MiB")
+        results.add("service", "memory after", resident_mib(service.process), "MiB")
         client.end(_MAP)
         _measure_one(results, client, settings, report_progress)
     return results
@@ -98,7 +97,7 @@ class _Pushed:
 
 def _push(service: Serving, client: Client, frames: _Stamps, seconds: float) -> _Pushed:
     """Push a frame in each period; frames that are due while the previous one is in progress are dropped."""
-    found, before = _Pushed(), _cpu_seconds(service.process)
+    found, before = _Pushed(), cpu_seconds(service.process)
     due = begin = time.perf_counter()
     while due < begin + seconds:
         time.sleep(max(0.0, due - time.perf_counter()))
@@ -110,7 +109,7 @@ def _push(service: Serving, client: Client, frames: _Stamps, seconds: float) -> 
         while due < time.perf_counter():  # a camera does not wait
             due += frames.period
             found.dropped += 1
-    after = _cpu_seconds(service.process)
+    after = cpu_seconds(service.process)
     found.cpu_s = None if before is None or after is None else after - before
     return found
 
@@ -184,22 +183,3 @@ def _measure_one(
     results.add_time(case, "in process", inside)
     results.add_time(case, "npy over HTTP", outside)
     results.add(case, "HTTP adds", outside.median_ms - inside.median_ms, "ms")
-
-
-def _resident(process: subprocess.Popen[str]) -> float | None:
-    """Return the resident memory of a process [MiB]. If None, the system does not report it."""
-    try:
-        lines = Path(f"/proc/{process.pid}/status").read_text().splitlines()
-    except OSError:
-        return None
-    return next((int(line.split()[1]) / 1024 for line in lines if line.startswith("VmRSS")), None)
-
-
-def _cpu_seconds(process: subprocess.Popen[str]) -> float | None:
-    """Return the processor time of a process [s]. If None, the system does not report it."""
-    try:
-        stat = Path(f"/proc/{process.pid}/stat").read_text()
-    except OSError:
-        return None
-    user, system = stat.rpartition(")")[2].split()[11:13]
-    return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")

@@ -1,0 +1,237 @@
+"""Measurement of the costs of the service: two services on this machine, and one client."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import numpy as np
+from numpy.typing import NDArray
+
+from splatbot.bench.benchmark import ReportProgress
+from splatbot.bench.results import Results
+from splatbot.bench.service.process import cpu_seconds, resident_mib
+from splatbot.bench.sizing import SizingSettings
+from splatbot.bench.sizing.costs import COLLISIONS, DISTANCE, FRAME, PLACE, PLAN, Costs, RequestCost
+from splatbot.client import Client, ServiceError, pack_array
+from splatbot.collision import RobotSpheres
+from splatbot.errors import SplatbotError
+from splatbot.frame import Frame
+from splatbot.gaussians import GaussianModel
+from splatbot.logs import open_log
+from splatbot.robots.panda import panda
+from splatbot.services.tiled_fields import field_around
+from splatbot.serving import Serving, serving
+from splatbot.tiles import TiledMap, write_tiles
+
+Array = NDArray[np.float64]
+
+_EXTENT, _HEIGHT, _ROOM, _SIZE = 20.0, 3.0, 4.0, 0.03  # [m] of a building of 2 million Gaussians, and of a Gaussian
+_POINTS, _CONFIGURATIONS = 100, 20  # of a request
+_PLAN_MS, _BASE = 100.0, {"translation": [0.0, 0.5, 0.0]}
+_GOAL = np.array([0.3, -0.8, 0.0, -2.3, 0.0, 1.6, 0.8])  # [rad] of a Panda; plans end around it
+_PACKED = {"Content-Type": "application/msgpack", "Accept": "application/msgpack"}
+_MIB = 2**20
+
+
+def measure_costs(settings: SizingSettings, results: Results, report_progress: ReportProgress) -> Costs:
+    """Measure the costs, and append times of starts and requests to the results.
+
+    Raises:
+        SplatbotError: the system does not report memory and processor time, or a service fails.
+    """
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        report_progress(f"a tiled map of {settings.measured:,} simulated Gaussians")
+        model = simulated_building(settings.measured)
+        write_tiles(model, folder / "tiles", source="simulated building")
+        places = _places(settings)
+        memory, read = _measure_places(folder / "tiles", places)
+        disk = sum(file.stat().st_size for file in (folder / "tiles").iterdir()) / len(model)
+        report_progress("queries of the tiled map")
+        requests, shared = _measure_shared(settings, results, folder / "tiles", places)
+        report_progress("frames and plans")
+        more, live, map_bytes = _measure_live(settings, results, folder / "maps")
+        return Costs({**more, **requests}, memory, read, disk, shared, live, map_bytes)
+
+
+def simulated_building(count: int, seed: int = 0) -> GaussianModel:
+    """Return discs on floors, ceilings and walls of rooms, 5,000 of them a square metre of floor."""
+    rng = np.random.default_rng(seed)
+    side = _EXTENT * np.sqrt(count / 2e6)
+    kind, means = rng.integers(0, 4, count), rng.uniform(0.0, 1.0, (count, 3)) * (side, side, _HEIGHT)
+    means[kind == 0, 2], means[kind == 1, 2] = 0.0, _HEIGHT
+    for axis, walls in ((0, kind == 2), (1, kind == 3)):
+        means[walls, axis] = _ROOM * np.round(means[walls, axis] / _ROOM)
+    scales = _SIZE * np.exp(rng.normal(0.0, 0.3, (count, 3)))
+    scales[np.arange(count), np.array([2, 2, 0, 1])[kind]] = 0.05 * _SIZE
+    model = GaussianModel.from_activated(
+        means=means,
+        quats=np.tile((1.0, 0.0, 0.0, 0.0), (count, 1)),
+        scales=scales,
+        opacities=np.full(count, 0.9),
+        colors=np.full((count, 3), 0.5),
+    )
+    return replace(model, observations=model.observations + 9)
+
+
+def _places(settings: SizingSettings) -> Array:
+    """Return places (P, 3) [m] on the floor of the building."""
+    side = _EXTENT * np.sqrt(settings.measured / 2e6)
+    across = np.random.default_rng(1).uniform(0.1 * side, 0.9 * side, (max(3, settings.requests // 4), 2))
+    return np.column_stack([across, np.full(len(across), 0.1)])
+
+
+def _points(place: Array) -> Array:
+    return place + np.random.default_rng(2).uniform(-0.4, 0.4, (_POINTS, 3))
+
+
+def _configurations() -> Array:
+    spread = np.random.default_rng(3).uniform(-0.3, 0.3, (_CONFIGURATIONS, 7))
+    return np.asarray(panda().home + spread, np.float64)
+
+
+def _pose(place: Array) -> dict[str, list[float]]:
+    return {"translation": place.tolist(), "quaternion_wxyz": [1.0, 0.0, 0.0, 0.0]}
+
+
+def _measure_places(folder: Path, places: Array) -> tuple[float, float]:
+    """Return the memory and the tiles of a place [bytes], as the routes of the service load them."""
+    with TiledMap(folder, memory_mb=1e5) as tiles:
+        read = []
+        for place in places:
+            with TiledMap(folder, memory_mb=1e5) as alone:
+                field_around(alone, _points(place), "points")
+                _arm_field(alone, place)
+                read.append(alone.nbytes - alone.fields.nbytes)
+            field_around(tiles, _points(place), "points")
+            _arm_field(tiles, place)
+        return tiles.fields.nbytes / len(places) + float(np.mean(read)), float(np.mean(read))
+
+
+def _arm_field(tiles: TiledMap, place: Array) -> None:
+    T = np.eye(4)
+    T[:3, 3] = place
+    arm = RobotSpheres(panda(), T_world_base=T)
+    field_around(tiles, arm.centers(_configurations()).reshape(-1, 3), "q", room=float(arm.spheres.radii.max()))
+
+
+def _measure_shared(
+    settings: SizingSettings, results: Results, folder: Path, places: Array
+) -> tuple[dict[str, RequestCost], float]:
+    """Return the costs of queries of a served tiled map, and the memory of its process [bytes]."""
+    begin = time.perf_counter()
+    log = settings.folder / "shared.log"
+    with serving("--map", str(folder), log=log) as service, Client(service.url) as client:
+        results.add("process of the shared map", "start", time.perf_counter() - begin, "s")
+        process_bytes = _resident(service.process)
+
+        def distance(place: Array) -> tuple[int, int]:
+            return _post(client, "distance", {"points": _points(place)})
+
+        def collisions(place: Array) -> tuple[int, int]:
+            return _post(client, "collisions", {"q": _configurations(), "base": _pose(place)})
+
+        begin = time.perf_counter()
+        distance(places[0])
+        results.add("process of the shared map", "first query", 1e3 * (time.perf_counter() - begin), "ms")
+
+        def both(place: Array) -> tuple[int, int]:
+            first, second = distance(place), collisions(place)
+            return first[0] + second[0], first[1] + second[1]
+
+        costs = {PLACE: _cost(service, results, PLACE, [partial(both, place) for place in places])}
+        for kind, ask in ((DISTANCE, distance), (COLLISIONS, collisions)):
+            ask(places[0])
+            costs[kind] = _cost(service, results, kind, [partial(ask, places[0])] * settings.requests)
+        return costs, process_bytes
+
+
+def _measure_live(
+    settings: SizingSettings, results: Results, data: Path
+) -> tuple[dict[str, RequestCost], float, float]:
+    """Return the costs of frames and plans, and the memory of the process and of a robot's map [bytes].
+
+    The second of two equal maps gives the memory of a map, for the first one loads libraries too.
+    """
+    frames = list(open_log(settings.log))
+    begin = time.perf_counter()
+    log = settings.folder / "live.log"
+    with serving("--data", str(data), log=log) as service, Client(service.url) as client:
+        results.add("process of live maps", "start", time.perf_counter() - begin, "s")
+        before, costs = [], {}
+        for name in ("first", "second"):
+            before.append(_resident(service.process))
+            client.create_map(name, robot_base=_BASE)
+            pushes = [partial(_push, client, name, frame) for frame in frames]
+            costs[FRAME] = _cost(service, results, FRAME, pushes)
+        map_bytes = max(0.0, _resident(service.process) - before[1])
+        goals = _GOAL + np.random.default_rng(4).uniform(-0.6, 0.6, (max(2, settings.requests // 5), len(_GOAL)))
+        plans = [partial(_plan, client, {"goal": goal, "budget_ms": _PLAN_MS}) for goal in goals.tolist()]
+        costs[PLAN] = _cost(service, results, PLAN, plans)
+        return costs, before[1] - map_bytes, map_bytes
+
+
+def _cost(
+    service: Serving, results: Results, kind: str, requests: Sequence[Callable[[], tuple[int, int]]]
+) -> RequestCost:
+    """Send requests one after the other, which return the sizes of their bodies; append their median latency."""
+    before, seconds, sizes = _cpu(service.process), [], []
+    for send in requests:
+        begin = time.perf_counter()
+        sizes.append(send())
+        seconds.append(time.perf_counter() - begin)
+    cpu = (_cpu(service.process) - before) / len(requests)
+    results.add(kind, "latency p50", 1e3 * float(np.median(seconds)), "ms")
+    received, sent = np.mean(sizes, axis=0)
+    return RequestCost(cpu, float(received), float(sent))
+
+
+def _post(client: Client, route: str, body: dict[str, Any]) -> tuple[int, int]:
+    sent = msgpack.packb(body, default=pack_array)
+    answer, _ = client.request("POST", f"/v1/maps/default/{route}", sent, _PACKED)
+    return len(sent), len(answer)
+
+
+def _plan(client: Client, body: dict[str, Any]) -> tuple[int, int]:
+    sent = json.dumps(body).encode()
+    try:
+        answer, _ = client.request("POST", "/v1/maps/second/plans", sent, {"Content-Type": "application/json"})
+    except ServiceError as error:
+        if error.status != 422:
+            raise
+        return len(sent), 0  # the search for a path costs as much without one
+    return len(sent), len(answer)
+
+
+def _push(client: Client, map_id: str, frame: Frame) -> tuple[int, int]:
+    client.push(map_id, frame)
+    return frame.rgb.nbytes + frame.depth.nbytes, 0
+
+
+def _resident(process: subprocess.Popen[str]) -> float:
+    return _MIB * _known(resident_mib(process))
+
+
+def _cpu(process: subprocess.Popen[str]) -> float:
+    return _known(cpu_seconds(process))
+
+
+def _known(value: float | None) -> float:
+    """Return a figure of the system.
+
+    Raises:
+        SplatbotError: the system does not report it.
+    """
+    if value is None:
+        hint = "measure on Linux, or give --costs FILE"
+        raise SplatbotError("the system reports no memory and time of processes.", field="/proc", hint=hint)
+    return value
