@@ -57,8 +57,7 @@ _ANSWER = {
             "graspable_by_size": True,
             "reach": "in collision",
             "verdict": "in collision",
-            "obstacle": "no posture found that places the tool at its centre is free: link 4 (after panda_joint4) is "
-            "8.0 mm deep in the map or its 6.0 mm margin at (0.45, -0.20, 0.10) m from the base",
+            "obstacle": "no posture found that places the tool at its centre is free: link 4 is 8.0 mm deep in the map",
         },
     ],
 }

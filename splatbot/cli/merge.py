@@ -10,7 +10,7 @@ import tyro
 
 from splatbot.cli.paths import check_output, check_state
 from splatbot.errors import FormatError
-from splatbot.results.merge_output import check_merge
+from splatbot.results.merge_output import check_merge, draft_of
 
 if TYPE_CHECKING:
     from splatbot.mapping.alignment import MapAlignment
@@ -32,8 +32,8 @@ def merge(
 
     Several keyframes of B must agree on the pose of B in A; otherwise nothing is written. Surface of both is fused. A
     loses the surface that the depth of B sees through, and B adds the surface that A lacks. DIR is a run folder like
-    any other; its log plays both recordings (recordings.yaml). merge.json has the figures of the merge. After Ctrl-C
-    before the first map, a new DIR is removed.
+    any other; its log plays both recordings (recordings.yaml). merge.json has the figures of the merge. DIR is not
+    touched before the merged run is whole: Ctrl-C until then leaves it as it was.
 
     Examples:
         splatbot merge runs/monday runs/tuesday --out runs/both
@@ -43,7 +43,7 @@ def merge(
         a: a folder that `splatbot map` wrote, with its saved state.
         b: the later one.
         out: folder to write.
-        overwrite: replace the run that --out holds.
+        overwrite: replace the run that --out holds. Other files, as its scene.yaml, stay.
         no_report: write no audit, report.html and map.html, which take seconds.
         as_json: print merge.json.
         quiet: no progress and no summary.
@@ -51,6 +51,7 @@ def merge(
     check_runs(a, b)
     check_merge(a, b, out, overwrite=overwrite)
     check_output(out, folder=True)
+    check_output(draft_of(out), folder=True)
 
     from splatbot.cli.map_page import page_of_map
     from splatbot.cli.progress import progress_display, shares

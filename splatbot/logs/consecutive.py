@@ -35,6 +35,7 @@ class ConsecutiveLog(StampedLog):
         path: YAML file with the list ``recordings``; each has ``log``, and may have ``camera`` (a file) and
             ``time_offset`` [s], which is added to its stamps. Paths are relative to the file.
         opener: opens one recording.
+        uri: address that the log names as its own, if the file is moved there later. If None, it is the path.
 
     Raises:
         LogError: the file is damaged, the stamps do not increase from one recording to the next, or a recording does
@@ -42,8 +43,8 @@ class ConsecutiveLog(StampedLog):
         CameraError: there are no usable intrinsics.
     """
 
-    def __init__(self, path: str | Path, opener: Opener) -> None:
-        self.uri, self.name = str(path), Path(path).stem
+    def __init__(self, path: str | Path, opener: Opener, *, uri: str | None = None) -> None:
+        self.uri, self.name = uri or str(path), Path(path).stem
         self._file = Path(path)
         entries = _entries(self._file)
         cameras = [local_address(self._file, e["camera"]) if "camera" in e else None for e in entries]

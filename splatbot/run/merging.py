@@ -17,6 +17,7 @@ from splatbot.atomic import write_text
 from splatbot.errors import InputError
 from splatbot.geometry import adjoint, inverse, rotation_to_quat
 from splatbot.logs import open_log
+from splatbot.logs.consecutive import ConsecutiveLog
 from splatbot.logs.listed import stamps_of
 from splatbot.mapping.alignment import MapAlignment, align_maps
 from splatbot.mapping.depth_fusion import DepthNoiseModel
@@ -25,14 +26,14 @@ from splatbot.mapping.keyframes import Keyframe
 from splatbot.mapping.rigid_motion import move_gaussians, move_keyframe
 from splatbot.protocols import Array
 from splatbot.results.folder import RunFolder
-from splatbot.results.merge_output import RECORDINGS, check_merge
+from splatbot.results.merge_output import RECORDINGS, SUMMARY, check_merge, draft_of, replace_run
+from splatbot.run.interrupts import Interrupts
 from splatbot.run.job import RunResult, map_log
 from splatbot.run.outcome import MapPage
 from splatbot.run.progress import Progress
 from splatbot.run.state import Checkpoint, SavedRun
 from splatbot.slam import FrameResult, Slam
 
-SUMMARY = "merge.json"
 MAX_KEYFRAMES = 4000
 """Largest number of keyframes of the merged run: the images of as many at 640 x 480 take 9 GB."""
 
@@ -164,7 +165,8 @@ def merge_runs(
 
     Args:
         aligned: the runs. Gaussians and keyframes of B are moved; the runs on disk stay as they are.
-        out: folder to write. If an error or Ctrl-C leaves it without a map, a folder that is new is removed.
+        out: folder to write. It stays as it is until the merged run is whole, which then replaces it. An error or
+            Ctrl-C before that removes the unfinished run.
         on_progress: called at every phase.
         map_page: makes a page of the finished map for the report. If None, the report has no such page.
         report: audit the merged map and write the report.
@@ -175,33 +177,40 @@ def merge_runs(
         InputError: A and B are one run, ``out`` is one of them or holds a run, or it cannot be written.
     """
     check_merge(aligned.a.folder, aligned.b.folder, out, overwrite=overwrite)
-    folder = RunFolder.create(out)
+    draft = draft_of(out)
     try:
-        return _merge_into(folder, aligned, on_progress, map_page, report=report)
-    except BaseException:  # Ctrl-C too
-        if folder.is_new and not folder.map.exists():
-            shutil.rmtree(folder.path)
-        raise
+        shutil.rmtree(draft, ignore_errors=True)
+        found = _merge_into(RunFolder.create(draft), Path(out), aligned, on_progress, map_page, report=report)
+        with Interrupts():
+            replace_run(draft, out)
+        return found
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
 
 
 def _merge_into(
     folder: RunFolder,
+    out: Path,
     aligned: AlignedRuns,
     on_progress: Callable[[Progress], None] | None,
     map_page: MapPage | None,
     *,
     report: bool,
 ) -> MergedRun:
-    """Write the merged run."""
+    """Write the merged run into a folder that is later renamed to ``out``."""
     a, b, alignment = aligned.a, aligned.b, aligned.alignment
     time_offset = _write_recordings(folder.path / RECORDINGS, a, b)
-    log = open_log(folder.path / RECORDINGS)
+    log = ConsecutiveLog(
+        folder.path / RECORDINGS,
+        lambda address, camera: open_log(address, camera=camera),
+        uri=str((out / RECORDINGS).resolve()),
+    )
     slam, joined = merged_slam(a, b, alignment, first_index=a.place.frames, time_offset=time_offset)
     index, stamp = b.place.last_index, b.place.last_stamp
     place = replace(
         b.place,
         name=log.name,
-        uri=str((folder.path / RECORDINGS).resolve()),
+        uri=log.uri,
         frames=len(log),
         camera=None,
         next_index=len(log),
@@ -220,7 +229,7 @@ def _merge_into(
         report=report,
         source={"camera": None},
     )
-    found = MergedRun(result, alignment, joined, time_offset)
+    found = MergedRun(replace(result, folder=out), alignment, joined, time_offset)
     write_text(json.dumps(found.summary(), indent=2, allow_nan=False) + "\n")(folder.path / SUMMARY)
     return found
 

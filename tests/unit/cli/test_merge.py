@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -94,6 +95,37 @@ def test_an_interrupted_merge_leaves_no_folder_and_the_same_command_then_succeed
     assert run(*words).code == 0
     assert_fix_named(run(*words), "--overwrite")
     assert run(*words, "--overwrite").code == 0
+
+
+@pytest.mark.parametrize("failure", [KeyboardInterrupt, OSError(28, "No space left on device")])
+def test_a_merge_that_ends_early_leaves_the_earlier_run_whole_and_a_later_one_replaces_it(
+    run: RunCommand,
+    runs: tuple[str, str],
+    work_folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    failure: type[BaseException] | Exception,
+) -> None:
+    shutil.copytree(runs[0], "c")
+    for name in ("scene.yaml", "audit.json", "trajectory-left.tum"):
+        Path("c", name).write_text("earlier")
+    before = _files("c")
+    words = ("merge", *runs, "--out", "c", "--no-report", "--quiet", "--overwrite")
+    with monkeypatch.context() as patched:
+        patched.setattr("splatbot.run.merging.map_log", Mock(side_effect=failure))
+        assert run(*words).code in (1, 130)
+    assert _files("c") == before
+    assert [path.name for path in Path().iterdir()] == ["c"]
+    Path(".c.draft").mkdir()
+    Path(".c.draft", "map.ply").write_text("of a merge that was killed")
+    assert run(*words).code == 0
+    assert [path.name for path in Path().iterdir()] == ["c"]
+    after = {path.name for path in Path("c").iterdir()}
+    assert "scene.yaml" in after
+    assert {"recordings.yaml", "merge.json", "map.ply", "state"} <= after
+    assert not {"audit.json", "trajectory-left.tum"} & after
+    assert all("draft" not in file.read_text() for file in Path("c").glob("*.json"))
+    assert json.loads(Path("c/metrics.json").read_text())["log"]["uri"] == str(Path("c/recordings.yaml").resolve())
+    assert run("info", "c").code == run("diff", runs[0], "c", "--out", "d.png").code == 0
 
 
 def _files(folder: str | Path) -> dict[Path, bytes]:
