@@ -69,7 +69,7 @@ class ServiceSettings(BaseSettings):
     max_merge_gaussians: int = Field(2_000_000, ge=1, description="of both maps of one merge or comparison")
     max_merge_keyframes: int = Field(1000, ge=2, description="of both maps of one merge or comparison")
     max_points: int = Field(100_000, ge=1, description="points in one distance request")
-    tiles_mb: float = Field(24, gt=0, description="memory of the tiles of a tiled map [MB]")
+    tiles_mb: float = Field(24, gt=0, description="memory of the tiles of a tiled map, and of its fields [MB]")
     max_configurations: int = Field(10_000, ge=1, description="joint configurations in one request")
     max_views: int = Field(16, ge=1, description="views in one render request")
     max_pixels: int = Field(2_100_000, ge=1, description="pixels of one rendered view, or of one pushed frame")

@@ -43,7 +43,7 @@ class SizingSettings(Settings):
         disk: Disk of a node [GB].
         read: Speed of that disk [GB/s].
         link: Network link of a node, in each direction.
-        balancer: Network link of the balancer, in each direction.
+        balancer: Network link of a balancer, in each direction.
         load: Share of each resource that the plan uses.
         shard: Gaussians of one shard of the map, at most 50 million.
         costs: Measured costs of an earlier run (sizing.json). If not given, they are measured.
@@ -135,7 +135,7 @@ BENCHMARK = Benchmark(
         Table("Measured costs", _is_cost),
         Table("Plan of the fleet", cases("plan: fleet"), layout=per_metric),
         Table("Plan by resource; the first one saturates first", cases("plan: resource"), split_by=None),
-        Table("Simulated requests of one node", cases("simulated")),
+        Table("Simulated requests of a node, and of single processes on one core", cases("simulated")),
     ),
     plot=_plot,
 )

@@ -24,7 +24,7 @@ class Fleet:
         robots: number of robots.
         rates: requests of a robot by kind [Hz].
         cores, memory, disk, read, link: of a node; [bytes], [bytes/s] and, in each direction, [bit/s].
-        balancer: link of the balancer in each direction [bit/s].
+        balancer: link of a balancer in each direction [bit/s].
         load: share of each resource that a plan uses.
         shard: largest number of Gaussians of a shard.
     """
@@ -51,7 +51,7 @@ class FleetPlan:
         replicas: processes of each shard.
         live_processes: processes with the maps of single robots.
         tiles: memory of tiles and fields of a process of a shard [bytes].
-        nodes: number of nodes.
+        nodes, balancers: number of each.
     """
 
     shards: int
@@ -59,6 +59,7 @@ class FleetPlan:
     live_processes: int
     tiles: float
     nodes: int
+    balancers: int
 
 
 def plan_fleet(costs: Costs, fleet: Fleet) -> FleetPlan:
@@ -78,9 +79,9 @@ def plan_fleet(costs: Costs, fleet: Fleet) -> FleetPlan:
     if costs.shared_process + tiles > fleet.load * fleet.memory:
         need = (costs.shared_process + tiles) / fleet.load / 1e9
         raise InputError("is too small for a process.", field="--memory", hint=f"give {need:.3g} GB or more")
-    one = FleetPlan(shards, replicas, live, tiles, 1)
-    nodes = max(use for name, use in utilisation(costs, fleet, one, fleet.robots).items() if name in NODE)
-    return FleetPlan(shards, replicas, live, tiles, max(LEAST_REPLICAS, math.ceil(nodes / fleet.load)))
+    use = utilisation(costs, fleet, FleetPlan(shards, replicas, live, tiles, 1, 1), fleet.robots)
+    nodes, balancers = (math.ceil(max(use[name] for name in names) / fleet.load) for names in (NODE, BALANCER))
+    return FleetPlan(shards, replicas, live, tiles, max(LEAST_REPLICAS, nodes), balancers)
 
 
 def utilisation(costs: Costs, fleet: Fleet, plan: FleetPlan, robots: float) -> dict[str, float]:
@@ -98,8 +99,8 @@ def utilisation(costs: Costs, fleet: Fleet, plan: FleetPlan, robots: float) -> d
         "disk reads": robots * rates[PLACE] * costs.place_read / (plan.nodes * fleet.read),
         "link in": received / (plan.nodes * fleet.link),
         "link out": sent / (plan.nodes * fleet.link),
-        "balancer in": received / fleet.balancer,
-        "balancer out": sent / fleet.balancer,
+        "balancer in": received / (plan.balancers * fleet.balancer),
+        "balancer out": sent / (plan.balancers * fleet.balancer),
     }
 
 

@@ -14,6 +14,7 @@ from typing import Any
 
 import msgpack
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from splatbot.bench.benchmark import ReportProgress
@@ -22,7 +23,7 @@ from splatbot.bench.service.process import cpu_seconds, resident_mib
 from splatbot.bench.sizing import SizingSettings
 from splatbot.bench.sizing.costs import COLLISIONS, DISTANCE, FRAME, PLACE, PLAN, Costs, RequestCost
 from splatbot.client import Client, ServiceError, pack_array
-from splatbot.collision import RobotSpheres
+from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.errors import SplatbotError
 from splatbot.frame import Frame
 from splatbot.gaussians import GaussianModel
@@ -36,6 +37,7 @@ Array = NDArray[np.float64]
 
 _EXTENT, _HEIGHT, _ROOM, _SIZE = 20.0, 3.0, 4.0, 0.03  # [m] of a building of 2 million Gaussians, and of a Gaussian
 _POINTS, _CONFIGURATIONS = 100, 20  # of a request
+_IN_MEMORY = 200_000  # Gaussians of the map in memory
 _PLAN_MS, _BASE = 100.0, {"translation": [0.0, 0.5, 0.0]}
 _GOAL = np.array([0.3, -0.8, 0.0, -2.3, 0.0, 1.6, 0.8])  # [rad] of a Panda; plans end around it
 _PACKED = {"Content-Type": "application/msgpack", "Accept": "application/msgpack"}
@@ -55,6 +57,7 @@ def measure_costs(settings: SizingSettings, results: Results, report_progress: R
         write_tiles(model, folder / "tiles", source="simulated building")
         places = _places(settings)
         memory, read = _measure_places(folder / "tiles", places)
+        results.add("Gaussian", "memory", _memory_each(model), "byte", note="of a map in memory, with its field")
         disk = sum(file.stat().st_size for file in (folder / "tiles").iterdir()) / len(model)
         report_progress("queries of the tiled map")
         requests, shared = _measure_shared(settings, results, folder / "tiles", places)
@@ -81,6 +84,12 @@ def simulated_building(count: int, seed: int = 0) -> GaussianModel:
         colors=np.full((count, 3), 0.5),
     )
     return replace(model, observations=model.observations + 9)
+
+
+def _memory_each(model: GaussianModel) -> float:
+    """Return the memory of a Gaussian of a map in memory, with its share of the collision field [bytes]."""
+    part = model.select(torch.arange(min(len(model), _IN_MEMORY)))
+    return (part.nbytes + GaussianCollisionField(part).nbytes) / len(part)
 
 
 def _places(settings: SizingSettings) -> Array:

@@ -29,13 +29,16 @@ def run_sizing(settings: SizingSettings, report_progress: ReportProgress) -> Res
     fleet = _fleet(settings)
     plan = plan_fleet(costs, fleet)
     _add_plan(results, costs, fleet, plan)
-    report_progress(f"simulating {settings.simulated:,} requests of a node, and of a process of a shard")
+    report_progress(f"simulating {settings.simulated:,} requests of a node, and of a process of each kind")
     node = fleet.robots / plan.nodes
     _add_simulation(results, "node", costs, fleet, fleet.rates, node, fleet.cores, settings.simulated)
-    queries = {kind: fleet.rates[kind] for kind in (COLLISIONS, DISTANCE, PLACE)}
-    if fleet.rates[PLACE]:
-        robots = fleet.robots / (plan.shards * plan.replicas)
-        _add_simulation(results, "process of a shard", costs, fleet, queries, robots, 1, settings.simulated)
+    for name, processes, kinds in (
+        ("process of a shard", plan.shards * plan.replicas, (COLLISIONS, DISTANCE, PLACE)),
+        ("process of live maps", plan.live_processes, (FRAME, PLAN)),
+    ):
+        rates = {kind: fleet.rates[kind] for kind in kinds}
+        if any(rates.values()):
+            _add_simulation(results, name, costs, fleet, rates, fleet.robots / processes, 1, settings.simulated)
     counts = (_CURVE * fleet.robots).tolist()
     curves = [utilisation(costs, fleet, plan, count) for count in counts]
     results.curves = {"robots": counts, "planned": fleet.robots, "utilisation": curves}
@@ -62,7 +65,6 @@ def _fleet(settings: SizingSettings) -> Fleet:
 
 def _add_plan(results: Results, costs: Costs, fleet: Fleet, plan: FleetPlan) -> None:
     use, most = utilisation(costs, fleet, plan, fleet.robots), most_robots(costs, fleet, plan)
-    balancers = np.ceil(max(use["balancer in"], use["balancer out"]) / fleet.load)
     for metric, value, unit in (
         ("Gaussians", fleet.gaussians, ""),
         ("robots", fleet.robots, ""),
@@ -71,7 +73,7 @@ def _add_plan(results: Results, costs: Costs, fleet: Fleet, plan: FleetPlan) -> 
         ("processes of the shared map", plan.shards * plan.replicas, ""),
         ("processes of live maps", plan.live_processes, ""),
         ("nodes", plan.nodes, ""),
-        ("balancers", balancers, ""),
+        ("balancers", plan.balancers, ""),
         ("SPLATBOT_TILES_MB", plan.tiles / 1e6, "MB"),
         ("memory of a node in use", use["memory"] * fleet.memory / 1e9, "GB"),
         ("disk of a node in use", use["disk"] * fleet.disk / 1e9, "GB"),

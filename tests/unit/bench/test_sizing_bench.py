@@ -102,6 +102,7 @@ def test_a_plan_keeps_every_process_and_node_within_its_share() -> None:
     assert max(share for name, share in use.items() if "balancer" not in name) <= FLEET.load
     less = utilisation(COSTS, FLEET, replace(plan, nodes=plan.nodes - 1), FLEET.robots)
     assert max(share for name, share in less.items() if "balancer" not in name) > FLEET.load
+    assert max(use["balancer in"], use["balancer out"]) <= FLEET.load
     assert plan.tiles == pytest.approx(math.ceil(1000 / (plan.shards * plan.replicas)) * 10e6)
 
 
@@ -121,7 +122,7 @@ def test_few_robots_still_have_two_processes_of_each_shard_on_two_nodes() -> Non
     ],
 )
 def test_the_first_resource_that_is_full_is_the_one_made_scarce(fleet: Fleet, first: str) -> None:
-    plan = replace(plan_fleet(COSTS, replace(fleet, load=0.9)), nodes=10)
+    plan = replace(plan_fleet(COSTS, replace(fleet, load=0.9)), nodes=10, balancers=1)
     most = most_robots(COSTS, fleet, plan)
     assert min(most, key=lambda name: most[name]) == first
     assert utilisation(COSTS, fleet, plan, most[first])[first] == pytest.approx(1.0)
@@ -192,6 +193,7 @@ def test_the_costs_of_two_services_are_measured(tmp_path: Path) -> None:
     for kind in (*KINDS, PLACE):
         assert (results.find(kind, "latency p50") or 0) > 0.1, kind
         assert (results.find(kind, "request") or 0) > 0.01, kind
+    assert 76.0 + 56.0 < (results.find("Gaussian", "memory") or 0) < 1000.0
     assert 76.0 < (results.find("Gaussian", "disk") or 0) < 250.0
     assert (results.find("process of the shared map", "memory") or 0) > 100.0
     assert (results.find("process of the shared map", "start") or 0) > 0.1
