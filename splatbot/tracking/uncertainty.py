@@ -66,12 +66,13 @@ class Uncertainty:
     def covariance(self, view: CalibratedView) -> Array:
         """Return the covariance (6, 6) of the same twist with the errors of calibration, which do not average out.
 
-        With the length l and the angle α of the chain, the relative error c, the velocity ϖ of the camera, the depth z
-        and the focal length f::
+        With the length l and the angle α of the chain, the velocity ϖ of the camera, the depth z and the focal length f::
 
             C = Σ_random + σ_stamp² ϖ ϖᵀ + diag(a, a, a, b, b, b)
             a = (c l)² / 3 + (σ_image z / f)²
             b = (c α)² / 3 + (σ_image / f)²
+
+        The relative error c is ``calibration_error``.
         """
         sensor = view.sensor
         shift = (sensor.calibration_error * self.moved) ** 2 / 3 + (sensor.image_sigma * view.depth / view.focal) ** 2

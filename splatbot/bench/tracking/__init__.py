@@ -34,8 +34,8 @@ class TrackingSettings(Settings):
     Each log is tracked with each time budget, and by other trackers in the same process. These are RGB-D odometry of
     OpenCV and of Open3D, small_gicp, and ORB with PnP against keyframes. Errors are the ATE (RMSE over all tracked
     frames after rigid alignment) and the RPE. Times end when the pose is known; decoding and mapping do not count.
-    NEES / 6 is 1 for consistent covariances. It includes the error of the reference, but for the pose of the camera on
-    the body that the reference follows, which is fitted; "as given" contains that too.
+    NEES / 6 is 1 for consistent covariances. It includes the error of the reference. The pose of the
+    camera on the body that the reference follows is fitted, but not in "as given".
 
     --ablation also runs splatbot without bundle adjustment, and with replaced keyframes, with the first budget.
     "Jumps reported as ok" counts frames with the verdict "ok" whose motion since the last frame is wrong by more than
