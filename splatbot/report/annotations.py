@@ -39,15 +39,14 @@ class AnnotationConstants:
 CONSTANTS = AnnotationConstants()
 
 Color = tuple[float, float, float]
+GREY: Color = (0.5, 0.5, 0.5)
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 _LIGHT, _DARK = (242, 242, 242), (25, 28, 32)
 
 
 def with_legend(image: NDArray[np.float32], rows: Sequence[tuple[str, Color]]) -> NDArray[np.float32]:
     """Return an image (H, W, 3) in 0..1 with names and their colours in the upper left corner."""
-    fits = max((image.shape[0] - 14) // CONSTANTS.row, 1)
-    if len(rows) > fits:
-        rows = [*rows[: fits - 1], (f"and {len(rows) - fits + 1} more", (0.5, 0.5, 0.5))]
+    rows = fitting(rows, image.shape[0])
     width, height = legend_size(rows)
     marked = _bytes(image)
     corner = marked[:height, :width]
@@ -57,6 +56,19 @@ def with_legend(image: NDArray[np.float32], rows: Sequence[tuple[str, Color]]) -
         cv2.line(marked, (14, y - 5), (38, y - 5), _shade(color), 5, cv2.LINE_AA)
         cv2.putText(marked, name, (46, y), _FONT, CONSTANTS.font, _LIGHT, 1, cv2.LINE_AA)
     return _floats(marked)
+
+
+def fitting(
+    rows: Sequence[tuple[str, Color]], height: int, *, last: Sequence[tuple[str, Color]] = ()
+) -> list[tuple[str, Color]]:
+    """Return the rows of a legend that fit a picture's height [px], and then the rows ``last``.
+
+    If some do not fit, a row counts them.
+    """
+    fits = max((height - 14) // CONSTANTS.row - len(last), 1)
+    if len(rows) > fits:
+        rows = [*rows[: fits - 1], (f"and {len(rows) - fits + 1} more", GREY)]
+    return [*rows, *last]
 
 
 def legend_size(rows: Sequence[tuple[str, Color]]) -> tuple[int, int]:

@@ -14,7 +14,7 @@ from splatbot.gaussians.harmonics import rgb_to_sh
 from splatbot.geometry import inverse, look_at, transform_points
 from splatbot.grasping.object_list import ListedObject
 from splatbot.rasterize.views import render_view, to_png
-from splatbot.report.annotations import legend_size, with_legend, with_numbers, with_scale
+from splatbot.report.annotations import GREY, fitting, legend_size, with_legend, with_numbers, with_scale
 from splatbot.report.robot_drawing import BACKGROUND
 from splatbot.segmentation import SegmentedMap
 
@@ -75,9 +75,8 @@ def objects_png(scene: SegmentedMap, found: Sequence[ListedObject], *, width: in
         for n, (x, y, z) in seen.items()
         if z > 0
     }
-    rows = [(_described(item), hues[item.number]) for item in found]
-    if len(found) < listed:
-        rows.append((_LEFT_OUT.format(listed - len(found), 1e3 * CONSTANTS.min_size), (0.5, 0.5, 0.5)))
+    left_out = [(_LEFT_OUT.format(listed - len(found), 1e3 * CONSTANTS.min_size), GREY)] if len(found) < listed else []
+    rows = fitting([(_described(item), hues[item.number]) for item in found], height, last=left_out)
     image = with_numbers(image, places, hues, free_of=legend_size(rows))
     image = with_legend(image, rows)
     return to_png(with_scale(image, camera, CONSTANTS.distance * radius, "in the middle"), "rgb")

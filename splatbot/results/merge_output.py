@@ -52,7 +52,7 @@ def draft_of(out: str | Path) -> Path:
 
 
 def replace_run(draft: Path, out: str | Path) -> None:
-    """Rename a finished run to ``out``. Of an earlier run there, only files of other commands stay, as scene.yaml.
+    """Rename a finished run to ``out``. An earlier run there is removed; files of other commands stay, as scene.yaml.
 
     Until the last rename, ``out`` is the earlier run; after an error too.
 

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from splatbot.camera import Camera
-from splatbot.report.annotations import CONSTANTS, _apart, with_legend, with_numbers, with_scale
+from splatbot.report.annotations import CONSTANTS, _apart, fitting, legend_size, with_legend, with_numbers, with_scale
 
 CAMERA = Camera(600.0, 600.0, 319.5, 239.5, 640, 480)
 
@@ -47,6 +47,11 @@ def test_a_legend_that_does_not_fit_says_how_many_are_left_out() -> None:
     image = with_legend(grey(), rows)
     assert image.shape == grey().shape
     np.testing.assert_allclose(image[:, 400:], grey()[:, 400:], atol=2e-3)
+    kept = fitting(rows, 480, last=[("7 pieces are only in the list", (0.5, 0.5, 0.5))])
+    assert legend_size(kept)[1] <= 480
+    *named, (more, _), (pieces, _) = kept
+    assert more == f"and {100 - len(named)} more"
+    assert pieces == "7 pieces are only in the list"
     few = with_legend(grey(), rows[:2])
     np.testing.assert_allclose(few[80:], grey()[80:], atol=2e-3)
     assert not np.allclose(few[:58], grey()[:58])
