@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -116,34 +115,30 @@ def test_wrong_input_is_named_with_a_fix(
 
 
 @pytest.mark.long
-def test_a_run_killed_at_random_moments_ends_with_the_bits_of_one_that_was_not(scene: Path, tmp_path: Path) -> None:
-    words = (
-        str(scene),
-        "--iterations",
-        "1500",
-        "--strategy",
-        "mcmc",
-        "--checkpoint-every",
-        "0.3",
-        "--max-gaussians",
-        "2000",
-    )
+def test_a_run_killed_at_ten_random_moments_ends_with_the_bits_of_one_that_was_not(scene: Path, tmp_path: Path) -> None:
+    often = ("--checkpoint-every", "0.1")
+    words = (str(scene), "--iterations", "1500", "--strategy", "mcmc", "--max-gaussians", "2000", *often)
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     assert finish(start(*words, "--out", str(whole)))[0] == 0
-    rng = np.random.default_rng(4)
+    rng, reached = np.random.default_rng(4), [0]
     process = start(*words, "--out", str(cut))
-    until(lambda: (cut / "checkpoint.pt").is_file())
-    for _ in range(4):
-        time.sleep(float(rng.uniform(0.0, 1.0)))
-        os.kill(process.pid, signal.SIGKILL)
+    for _ in range(10):
+        until(lambda: (cut / "checkpoint.pt").is_file() and checkpoint(cut) > reached[-1])
+        time.sleep(float(rng.uniform(0.0, 0.3)))
+        assert process.poll() is None  # it still trains
+        process.kill()
         process.communicate()
-        before = TrainingFolder(cut).load_checkpoint()["iteration"]
-        process = start("--resume", str(cut), "--checkpoint-every", "0.3")
-        while process.poll() is None and TrainingFolder(cut).load_checkpoint()["iteration"] == before:
-            time.sleep(0.05)
+        reached.append(checkpoint(cut))
+        process = start("--resume", str(cut), *often)
     code, _, err = finish(process)
     assert code == 0, err
+    assert reached == sorted(set(reached))
     assert (cut / "map.ply").read_bytes() == (whole / "map.ply").read_bytes()
+
+
+def checkpoint(folder: Path) -> int:
+    """Return the iterations of the last checkpoint of a training."""
+    return int(TrainingFolder(folder).load_checkpoint()["iteration"])
 
 
 @pytest.mark.long
