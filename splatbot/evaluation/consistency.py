@@ -55,8 +55,8 @@ def nees(
     out of the result, because it defines the world of the estimate.
 
     Without ``fit_mount``, A aligns the first common frame and B is the identity. With it, A and B minimise Σ ξᵀ C⁻¹ ξ,
-    with a robust loss and a prior of B. Motion capture and arms follow a body that carries the camera. The calibration of
-    this mount is often wrong by a degree.
+    with a robust loss and a prior of B. Motion capture and arms follow a body that carries the camera. The calibration
+    of this mount is often wrong by a degree.
 
     Args:
         reference: true poses.

@@ -66,7 +66,7 @@ class Uncertainty:
     def covariance(self, view: CalibratedView) -> Array:
         """Return the covariance (6, 6) of the same twist with the errors of calibration, which do not average out.
 
-        With the length l and the angle α of the chain, the velocity ϖ of the camera, the depth z and the focal length f::
+        With the length l and the angle α of the chain, the camera's velocity ϖ, the depth z and the focal length f::
 
             C = Σ_random + σ_stamp² ϖ ϖᵀ + diag(a, a, a, b, b, b)
             a = (c l)² / 3 + (σ_image z / f)²
