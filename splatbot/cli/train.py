@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -17,6 +18,7 @@ from splatbot.errors import InputError
 from splatbot.layouts import MAP_NAME
 
 if TYPE_CHECKING:
+    from splatbot.gaussians import GaussianModel
     from splatbot.results.folder import RunFolder
     from splatbot.training.datasets import TrainingData
     from splatbot.training.distributed import TrainingGroup
@@ -44,6 +46,7 @@ def train(
     antialiased: bool = False,
     batch: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
     processes: Annotated[int, tyro.conf.arg(metavar="N")] = 1,
+    blocks: Annotated[int, tyro.conf.arg(metavar="N")] = 1,
     held_out_every: Annotated[int, tyro.conf.arg(metavar="K")] = 8,
     seed: int = 0,
     checkpoint_every: Annotated[float, tyro.conf.arg(metavar="S")] = 60.0,
@@ -68,6 +71,7 @@ def train(
         splatbot train scenes/phone --refine-poses
         splatbot train runs/desk --minutes 5
         splatbot train scenes/garden --processes 4
+        splatbot train scenes/town --blocks 8 --processes 2
         splatbot train --resume runs/lego
         splatbot render runs/lego --video lego.mp4
 
@@ -90,6 +94,8 @@ def train(
         batch: photographs of each step; one for each process by default.
         processes: number of processes that train together; each takes its share of the photographs of a step. For
             several machines use torchrun (docs/guide/distributed.md).
+        blocks: number of blocks of the scene that are trained apart and merged. Memory then follows a block, and
+            --processes is the number of blocks that train at the same time.
         held_out_every: each K-th view is held out; 0 trains on all.
         seed: of the random draws.
         checkpoint_every: time between two checkpoints [s].
@@ -130,13 +136,19 @@ def train(
             refine_poses=refine_poses,
             antialiased=antialiased,
             seed=seed,
-            batch=group.size if batch is None else batch,
+            batch=batch if batch is not None else group.size if blocks == 1 else 1,
         )
         default = dataset / _OF_A_RUN if data.kind == "run" else Path("runs") / f"{dataset.resolve().name}-trained"
         folder = TrainingFolder(out or default)
         if group.leads:
             folder.check_free(overwrite=overwrite)
-        settings = TrainingSettings(dataset.resolve(), scale, held_out_every, options)
+        settings = TrainingSettings(dataset.resolve(), scale, held_out_every, options, blocks)
+    if settings.blocks != 1:
+        if group.size != processes:
+            raise InputError("is for one machine.", field="--blocks", hint="leave torchrun out")
+        return _train_blocks(
+            data, folder, settings, processes, checkpoint_every, log, resumed=resume is not None, quiet=quiet
+        )
     quiet = quiet or not group.leads
     return _train(data, folder, settings, group, checkpoint_every, log, resumed=resume is not None, quiet=quiet)
 
@@ -152,20 +164,18 @@ def _train(
     resumed: bool,
     quiet: bool,
 ) -> int:
-    from splatbot.gaussians import GaussianModel
     from splatbot.report.training import training_pictures
     from splatbot.results.folder import RunFolder
     from splatbot.run.interrupts import Interrupts
     from splatbot.training.distributed import connected
     from splatbot.training.session import TrainingSession
 
-    its_own = data.kind == "run" and folder.path.resolve() == (data.folder / _OF_A_RUN).resolve()
-    in_place = its_own and settings.options.keeps_frame
+    in_place = _is_in_place(data, folder, settings)
     with Interrupts() as interrupts, _progress(quiet) as report:
         with ExitStack() as processes:
             with interrupts.interruptible():
                 processes.enter_context(connected(group, settings, log))
-                start = GaussianModel.load(RunFolder(data.folder).map) if data.kind == "run" and group.leads else None
+                start = _start(data, folder, settings) if group.leads else None
                 session = TrainingSession(
                     data, folder, settings, start=start, checkpoint_s=checkpoint_every, resume=resumed, group=group
                 )
@@ -182,10 +192,72 @@ def _train(
                 _rescore(RunFolder(data.folder), log)
     if not quiet:
         _print(folder, data.folder / MAP_NAME if in_place else folder.map, scores)
-    if not scores["complete"]:
-        print(f"interrupted; continue with: splatbot train --resume {folder.path}", file=sys.stderr)
-        return 128 + (interrupts.requested or 2)
+    return 0 if scores["complete"] else _interrupted(folder, interrupts.requested)
+
+
+def _train_blocks(
+    data: TrainingData,
+    folder: TrainingFolder,
+    settings: TrainingSettings,
+    at_once: int,
+    checkpoint_every: float,
+    log: str | None,
+    *,
+    resumed: bool,
+    quiet: bool,
+) -> int:
+    from splatbot.report.training import training_pictures
+    from splatbot.results.folder import RunFolder
+    from splatbot.run.interrupts import Interrupts
+    from splatbot.training.block_training import BlockTraining
+
+    def report(line: str) -> None:
+        if not quiet:
+            print(line, file=sys.stderr, flush=True)
+
+    in_place = _is_in_place(data, folder, settings)
+    with Interrupts() as interrupts:
+        with interrupts.interruptible():
+            training = BlockTraining(data, folder, settings, start=_start(data, folder, settings), resume=resumed)
+        if not training.run(
+            at_once,
+            checkpoint_s=checkpoint_every,
+            log=log,
+            report=report,
+            stop=lambda: interrupts.requested is not None,
+        ):
+            return _interrupted(folder, interrupts.requested)
+        model = training.merge()
+        if in_place:
+            RunFolder(data.folder).replace_map(model)
+        with interrupts.interruptible():
+            scores = training.score(model, training_pictures, report)
+            if in_place:
+                _rescore(RunFolder(data.folder), log)
+    if not quiet:
+        _print(folder, data.folder / MAP_NAME if in_place else folder.map, scores)
     return 0
+
+
+def _is_in_place(data: TrainingData, folder: TrainingFolder, settings: TrainingSettings) -> bool:
+    """Return whether the trained map replaces that of its run."""
+    its_own = data.kind == "run" and folder.path.resolve() == (data.folder / _OF_A_RUN).resolve()
+    return its_own and settings.options.keeps_frame
+
+
+def _start(data: TrainingData, folder: TrainingFolder, settings: TrainingSettings) -> GaussianModel | None:
+    """Load the Gaussians of the start: those of a block or of a run; None for the points of the dataset."""
+    from splatbot.gaussians import GaussianModel
+    from splatbot.results.folder import RunFolder
+
+    if settings.block is not None:
+        return GaussianModel.load(folder.start)
+    return GaussianModel.load(RunFolder(data.folder).map) if data.kind == "run" else None
+
+
+def _interrupted(folder: TrainingFolder, number: int | None) -> int:
+    print(f"interrupted; continue with: splatbot train --resume {folder.path}", file=sys.stderr)
+    return 128 + (number or signal.SIGINT)
 
 
 def _rescore(run: RunFolder, log: str | None) -> None:

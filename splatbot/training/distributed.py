@@ -21,9 +21,9 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from splatbot.errors import InputError, SplatbotError
+from splatbot.errors import InputError
 from splatbot.training.folder import TrainingFolder, TrainingSettings
-from splatbot.training.helpers import Helper, started_helpers, threads_each
+from splatbot.training.helpers import LostProcessError, check_helpers, started_helpers, threads_each
 
 _MOST_PROCESSES = 64  # that one command starts
 _VARIABLES = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
@@ -31,10 +31,6 @@ _FILE = "file://"  # in place of an address: processes of one machine meet in a 
 _LOOPBACK = "lo0" if sys.platform == "darwin" else "lo"
 _POLL_S = 0.02
 _ENDING_S = 5.0  # until the process at fault has ended
-
-
-class GroupError(SplatbotError):
-    """A process of a distributed training is gone."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +58,7 @@ class TrainingGroup:
         """Replace each contiguous tensor by its sum over the processes; all receive the same bits.
 
         Raises:
-            GroupError: a process is gone.
+            LostProcessError: a process is gone.
         """
         if self.size > 1:
             with _answering():
@@ -73,7 +69,7 @@ class TrainingGroup:
         """Return the time of process 0 [s], and whether any process wants to stop.
 
         Raises:
-            GroupError: a process is gone.
+            LostProcessError: a process is gone.
         """
         values = torch.tensor([seconds if self.leads else 0.0, float(stop)], dtype=torch.float64)
         self.sum(values)
@@ -83,7 +79,7 @@ class TrainingGroup:
         """Return the state of process 0: tensors and plain values by name; no code is read from it.
 
         Raises:
-            GroupError: a process is gone.
+            LostProcessError: a process is gone.
         """
         buffer = io.BytesIO()
         torch.save(dict(state), buffer)
@@ -132,7 +128,7 @@ def connected(group: TrainingGroup, settings: TrainingSettings, log: str | None 
         log: where the recording of a run is now, if it was moved.
 
     Raises:
-        GroupError: a process ended early, or does not answer.
+        LostProcessError: a process ended early, or does not answer.
         InputError: there are more processes than images in a step.
     """
     batch = settings.options.batch
@@ -174,24 +170,17 @@ def _local(group: TrainingGroup, settings: TrainingSettings, log: str | None) ->
             for rank in range(1, size)
         ]
         while not store.check([str(rank) for rank in range(size)]):
-            _check(helpers)
+            check_helpers(helpers)
             time.sleep(_POLL_S)
         try:
             with _joined(group, store):
                 yield
-        except GroupError:
+        except LostProcessError:
             end = time.monotonic() + _ENDING_S
             while time.monotonic() < end:
-                _check(helpers)
+                check_helpers(helpers)
                 time.sleep(_POLL_S)
             raise
-
-
-def _check(helpers: list[Helper]) -> None:
-    """Raise the failure of a helper that ended early; that which caused the failures of the others has priority."""
-    failed = sorted((helper for helper in helpers if helper.failure()), key=lambda helper: helper.process.poll() == 1)
-    if failed:
-        raise GroupError(failed[0].failure(), hint="`splatbot train --resume` continues from the last checkpoint")
 
 
 @contextmanager
@@ -207,13 +196,13 @@ def _joined(group: TrainingGroup, store: dist.Store | None) -> Iterator[None]:
 
 @contextmanager
 def _answering() -> Iterator[None]:
-    """Turn an error of the connection in the block into a GroupError."""
+    """Turn an error of the connection in the block into a LostProcessError."""
     try:
         yield
     except RuntimeError as error:
         reason = str(error).strip().splitlines()[0]
         hint = "`splatbot train --resume` continues from the last checkpoint"
-        raise GroupError(f"another process does not answer ({reason}).", field="processes", hint=hint) from error
+        raise LostProcessError(f"another process does not answer ({reason}).", field="processes", hint=hint) from error
 
 
 @contextmanager

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import pickle
+import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -18,6 +19,7 @@ from splatbot.formats.ply import save_ply
 from splatbot.gaussians import GaussianModel
 from splatbot.layouts import MAP_NAME, TRAINING_NAME
 from splatbot.results.metrics import without_nan
+from splatbot.training.blocks import Cut, SceneBlock
 from splatbot.training.options import TrainingOptions
 from splatbot.trajectory import Trajectory
 
@@ -34,12 +36,16 @@ class TrainingSettings:
         scale: the images are 1/``scale`` of their size.
         held_out_every: see :meth:`TrainingData.split`.
         options: of the trainer.
+        blocks: number of blocks that are trained apart.
+        block: the block of a training that is one of them.
     """
 
     dataset: Path
     scale: int
     held_out_every: int
     options: TrainingOptions
+    blocks: int = 1
+    block: SceneBlock | None = None
 
 
 @dataclass(frozen=True)
@@ -72,9 +78,11 @@ class TrainingFolder:
         self.trajectory = self.path / "trajectory.tum"
         self.progress = self.path / "progress.jsonl"
         self.scores = self.path / "scores.json"
+        self.start = self.path / "start.ply"  # of a block
+        self.blocks = self.path / "blocks"
 
     def begin(self, settings: TrainingSettings) -> None:
-        """Create the folder for a new training; the checkpoint of an earlier one is removed.
+        """Create the folder for a new training; the checkpoint and the blocks of an earlier one are removed.
 
         Raises:
             InputError: the folder cannot be written.
@@ -82,6 +90,7 @@ class TrainingFolder:
         try:
             self.path.mkdir(parents=True, exist_ok=True)
             self.checkpoint.unlink(missing_ok=True)
+            shutil.rmtree(self.blocks, ignore_errors=True)
             self.save_settings(settings)
         except OSError as error:
             hint = "name another folder"
@@ -108,9 +117,12 @@ class TrainingFolder:
                     f"is {values['format']!r}.", file=self.settings, field="format", hint="use a matching version"
                 )
             options = TrainingOptions(**values["options"])
-            return TrainingSettings(
-                Path(values["dataset"]), int(values["scale"]), int(values["held_out_every"]), options
-            )
+            block = values.get("block")
+            if block is not None:
+                cuts = tuple(Cut(**cut) for cut in block["cuts"])
+                block = SceneBlock(cuts, float(block["margin"]), tuple(block["views"]))
+            dataset, scale, every = Path(values["dataset"]), int(values["scale"]), int(values["held_out_every"])
+            return TrainingSettings(dataset, scale, every, options, int(values.get("blocks", 1)), block)
         except OSError as error:
             raise FormatError(f"cannot be read ({error.strerror}).", file=self.settings, hint=_HINT) from error
         except (ValueError, KeyError, TypeError, AttributeError) as error:

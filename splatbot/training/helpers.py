@@ -12,6 +12,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from splatbot.batch.workers import usable_cores
+from splatbot.errors import SplatbotError
+
+
+class LostProcessError(SplatbotError):
+    """A process that trains with this one, or for it, is gone."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +75,17 @@ def started_helpers(at_once: int) -> Iterator[Start]:
         for helper in helpers:
             helper.process.wait()
         os.close(leash)
+
+
+def check_helpers(helpers: Sequence[Helper]) -> None:
+    """Check that no helper has failed.
+
+    Raises:
+        LostProcessError: one has; a failure that others follow from has priority.
+    """
+    failed = sorted((helper for helper in helpers if helper.failure()), key=lambda helper: helper.process.poll() == 1)
+    if failed:
+        raise LostProcessError(failed[0].failure(), hint="`splatbot train --resume` continues from the last checkpoint")
 
 
 def threads_each(at_once: int) -> int:

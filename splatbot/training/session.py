@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import fmean
 from typing import Any
 
@@ -77,7 +77,7 @@ class TrainingSession:
 
     Raises:
         FormatError: the checkpoint is damaged.
-        GroupError: another process of the group is gone.
+        LostProcessError: another process of the group is gone.
         InputError: the images do not fit into memory, or are not those of the checkpoint or of the first process.
     """
 
@@ -95,7 +95,9 @@ class TrainingSession:
         self.folder = folder
         self.group = group
         train, held_out = data.split(settings.held_out_every)
-        check_memory(data)
+        if settings.block is not None:
+            train, held_out = tuple(view for view in train if view.name in settings.block.views), ()
+        check_memory(replace(data, views=train + held_out))
         pixels = sum(view.camera.width * view.camera.height for view in train)
         self.options: TrainingOptions = settings.options.capped(pixels)
         self.images, self.held_out = ImageCache(train), ImageCache(held_out)
@@ -166,7 +168,7 @@ class TrainingSession:
             stop: called before each iteration; training ends once it returns True, and can be resumed.
 
         Raises:
-            GroupError: another process of the group is gone.
+            LostProcessError: another process of the group is gone.
         """
         saved = reported = time.monotonic()
         while not self._ended(stop()):

@@ -1,0 +1,184 @@
+"""Training of a scene in blocks: a process for each block, then the merge, the files and the scores of a training."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from math import ceil
+from statistics import fmean
+from typing import Any
+
+import numpy as np
+
+from splatbot.errors import InputError
+from splatbot.formats.ply import save_ply
+from splatbot.gaussians import GaussianModel
+from splatbot.training.blocks import SceneBlock, cut_scene, merged, start_of
+from splatbot.training.datasets import TrainingData
+from splatbot.training.folder import ProgressRow, TrainingFolder, TrainingSettings
+from splatbot.training.helpers import Helper, check_helpers, started_helpers
+from splatbot.training.images import ImageCache, check_memory
+from splatbot.training.initialize import initial_model
+from splatbot.training.scoring import score_held_out, summary
+from splatbot.training.session import CONSTANTS, Pictures
+from splatbot.trajectory import Trajectory
+
+_POLL_S = 0.1
+_LEAST_MINUTES = 0.01
+
+
+class BlockTraining:
+    """Trains the blocks of a scene, some at a time, and merges them.
+
+    Each block is a training of its own in ``blocks/N`` of the folder, with its settings, start and checkpoint.
+
+    Args:
+        data: the dataset.
+        folder: where the results go.
+        settings: of the run.
+        start: the Gaussians of the start; None for the points of the dataset, or random ones.
+        resume: continue with the blocks of the folder, if it has any.
+
+    Raises:
+        InputError: the scene cannot be cut into these blocks, or the poses are to be refined.
+    """
+
+    def __init__(
+        self,
+        data: TrainingData,
+        folder: TrainingFolder,
+        settings: TrainingSettings,
+        *,
+        start: GaussianModel | None = None,
+        resume: bool = False,
+    ) -> None:
+        if settings.options.refine_poses:
+            hint = "leave one out; the poses of a view would differ between its blocks"
+            raise InputError("cannot refine poses.", field="--blocks", hint=hint)
+        self.data = data
+        self.folder = folder
+        self.train, self.held_out = data.split(settings.held_out_every)
+        pixels = sum(view.camera.width * view.camera.height for view in self.train)
+        self.settings = replace(settings, options=settings.options.capped(pixels))
+        if not (resume and folder.blocks.exists()):
+            self._cut(start, resume=resume)
+
+    def _cut(self, start: GaussianModel | None, *, resume: bool) -> None:
+        """Write the settings and the start of each block, all or none."""
+        options = self.settings.options
+        if start is None:
+            assert options.max_gaussians is not None
+            if not len(self.data.points):
+                check_memory(self.data)  # random points need the images
+            start = initial_model(self.data, ImageCache(self.train), most=options.max_gaussians, seed=options.seed)
+        blocks = cut_scene(start.means.double().numpy(), self.train, self.settings.blocks)
+        if not resume:
+            self.folder.begin(self.settings)
+        draft = self.folder.path / ".blocks.draft"
+        shutil.rmtree(draft, ignore_errors=True)
+        for number, block in enumerate(blocks):
+            part, of_block = TrainingFolder(draft / str(number)), start_of(start, block, self.train, options.seed)
+            part.begin(self._settings_of(block, len(of_block) / len(start)))
+            save_ply(of_block, part.start, bookkeeping=True)
+        draft.rename(self.folder.blocks)
+
+    def _settings_of(self, block: SceneBlock, share: float) -> TrainingSettings:
+        """Return the settings of a block: steps by its share of the views, Gaussians by its share of the start."""
+        options = self.settings.options
+        if options.iterations is not None:
+            iterations = ceil(options.iterations * len(block.views) / len(self.train))
+            options = replace(options, iterations=iterations)
+        if options.minutes is not None:
+            options = replace(options, minutes=max(_LEAST_MINUTES, options.minutes / self.settings.blocks))
+        if options.max_gaussians is not None:
+            options = replace(options, max_gaussians=ceil(options.max_gaussians * share))
+        return replace(self.settings, options=options, blocks=1, block=block)
+
+    @property
+    def _parts(self) -> list[TrainingFolder]:
+        return [TrainingFolder(self.folder.blocks / str(number)) for number in range(self.settings.blocks)]
+
+    def run(
+        self,
+        at_once: int = 1,
+        *,
+        checkpoint_s: float = 60.0,
+        log: str | None = None,
+        report: Callable[[str], None] = lambda line: None,
+        stop: Callable[[], bool] = lambda: False,
+    ) -> bool:
+        """Train the blocks that are not finished, and return whether all are now.
+
+        Args:
+            at_once: number of blocks that are trained at the same time, each in its own process.
+            checkpoint_s: time between two checkpoints of a block [s].
+            log: where the recording of a run is now, if it was moved.
+            report: receives a line when a block begins or ends.
+            stop: called some times a second; the blocks in training are saved once it returns True.
+
+        Raises:
+            LostProcessError: the process of a block failed.
+        """
+        more = ["--quiet", "--checkpoint-every", str(checkpoint_s), *(() if log is None else ("--log", log))]
+        waiting = [part for part in self._parts if not _is_complete(part)]
+        running: list[Helper] = []
+        with started_helpers(at_once) as start:
+            while waiting or running:
+                if stop():
+                    for helper in running:
+                        helper.process.terminate()
+                    for helper in running:
+                        helper.process.wait()
+                    return False
+                check_helpers(running)
+                for helper in [helper for helper in running if helper.process.poll() == 0]:
+                    running.remove(helper)
+                    report(f"{helper.name} is trained")
+                while waiting and len(running) < at_once:
+                    part = waiting.pop(0)
+                    name = f"block {int(part.path.name) + 1} of {self.settings.blocks}"
+                    words = ["train", str(self.settings.dataset), "--resume", str(part.path), *more]
+                    report(f"{name} begins")
+                    running.append(start(name, words, part.path / "train.log", {}))
+                time.sleep(_POLL_S)
+        return True
+
+    def merge(self) -> GaussianModel:
+        """Return the map of all blocks, and save it with the poses of its images."""
+        blocks = [(part.load_settings().block, part) for part in self._parts]
+        model = merged([(block, part.map) for block, part in blocks if block is not None])
+        poses = np.stack([view.T_world_camera for view in self.train])
+        self.folder.save_map(model, Trajectory(np.arange(float(len(poses))), poses))
+        return model
+
+    def score(
+        self,
+        model: GaussianModel,
+        pictures: Pictures = lambda rows, scores: {},
+        report: Callable[[str], None] = lambda line: None,
+    ) -> dict[str, Any]:
+        """Score all held-out views of the merged map; write the scores and the pictures; return the scores."""
+        report("scoring")
+        options, shown = self.settings.options, CONSTANTS.shown_views
+        scores = score_held_out(model, ImageCache(self.held_out), options, self.data.scene_extent, shown=shown)
+        result = summary(scores)
+        parts = [json.loads(part.scores.read_text()) for part in self._parts]
+        rows = [json.loads(part.progress.read_text().splitlines()[-1]) for part in self._parts]
+        result |= {
+            "iterations": sum(part["iterations"] for part in parts),
+            "seconds": round(sum(part["seconds"] for part in parts), 1),
+            "gaussians": len(model),
+            "sh_degree": model.sh_degree,
+            "complete": True,
+        }
+        loss = fmean(row["loss"] for row in rows)
+        row = ProgressRow(result["iterations"], result["seconds"], loss, result["psnr_db"], len(model))
+        self.folder.save_scores([row], result, pictures([row], scores))
+        return result
+
+
+def _is_complete(part: TrainingFolder) -> bool:
+    return part.scores.exists() and bool(json.loads(part.scores.read_text())["complete"])
