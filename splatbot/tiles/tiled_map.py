@@ -9,6 +9,7 @@ import stat
 import threading
 import weakref
 from collections import OrderedDict
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -25,10 +26,11 @@ from splatbot.geometry import inverse, transform_points
 from splatbot.protocols import Array
 from splatbot.tiles.field import TiledField, checked_box
 from splatbot.tiles.fields import FieldCache
-from splatbot.tiles.index import DATA_NAME, GIVE_TILES, WRITE_AGAIN, TileIndex, read_index
+from splatbot.tiles.index import DATA_NAME, GIVE_TILES, WRITE_AGAIN, Tile, TileIndex, read_index
 from splatbot.tiles.part import MapPart, bytes_each, decode
 
 Numbers = NDArray[np.int64]
+Point = tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -113,14 +115,10 @@ class TiledMap:
         self._lock = threading.Lock()
         tiles = self.index.tiles
         self._counts = np.array([tile.count for tile in tiles], np.int64)
-        self._low = np.array([tile.low for tile in tiles]).reshape(-1, 3)
-        self._high = np.array([tile.high for tile in tiles]).reshape(-1, 3)
-        self._scales = np.maximum([tile.scale for tile in tiles], SCALE_FLOOR)
+        low, high, scales = _nested_bounds(tiles)
+        self._low, self._high = (np.array(corners, np.float64).reshape(-1, 3) for corners in (low, high))
+        self._scales = np.maximum(scales, SCALE_FLOOR)
         self._leaves = np.array([not tile.children for tile in tiles], np.bool_)
-        for number in np.flatnonzero(~self._leaves).tolist():  # children come first; bounds in a file may not be nested
-            family = [number, *tiles[number].children]
-            self._low[number], self._high[number] = self._low[family].min(axis=0), self._high[family].max(axis=0)
-            self._scales[number] = self._scales[family].max()
         if self._most < self._counts.max(initial=1):
             least = self._counts.max(initial=1) * self._bytes_each / 1e6
             raise TileMemoryError(f"is {memory_mb:g} MB.", field="memory_mb", hint=f"give {least:.3g} or more")
@@ -338,6 +336,21 @@ class TiledMap:
     @property
     def _path(self) -> Path:
         return self.folder / DATA_NAME
+
+
+def _nested_bounds(tiles: Sequence[Tile]) -> tuple[list[Point], list[Point], list[float]]:
+    """Return low and high corners, and largest standard deviations [m]; those of a parent enclose its children.
+
+    Children come first. Bounds in a file may not be nested.
+    """
+    low, high, scales = ([getattr(tile, name) for tile in tiles] for name in ("low", "high", "scale"))
+    for number, tile in enumerate(tiles):
+        if tile.children:
+            family = [number, *tile.children]
+            low[number] = tuple(map(min, *(low[member] for member in family)))
+            high[number] = tuple(map(max, *(high[member] for member in family)))
+            scales[number] = max(scales[member] for member in family)
+    return low, high, scales
 
 
 def _enlarged(box: tuple[Array, Array]) -> tuple[Array, Array]:
