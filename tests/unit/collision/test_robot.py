@@ -7,6 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+import torch
 
 from splatbot._native import ARM_ROUNDING, available_isas, set_isa
 from splatbot.bench.tabletop import tabletop
@@ -44,12 +45,12 @@ def _clearance(arm: RobotSpheres, q: Array) -> Array:
 
 def _self_gap(arm: RobotSpheres, q: Array) -> Array:
     """Compute the least gap (C,) between spheres of links that may not touch."""
-    at, radii, link = arm.centers(q), arm.spheres.radii, arm.spheres.link
+    at, radii, link = torch.from_numpy(arm.centers(q)), arm.spheres.radii, arm.spheres.link
     gaps = []
     for a, b in arm.pairs:
         i, j = np.flatnonzero(link == a), np.flatnonzero(link == b)
-        apart = np.linalg.norm(at[:, i, None] - at[:, None, j], axis=-1) - radii[i, None] - radii[j]
-        gaps.append(apart.reshape(len(q), -1).min(axis=1))
+        apart = torch.cdist(at[:, i], at[:, j], compute_mode="donot_use_mm_for_euclid_dist")
+        gaps.append((apart.numpy() - (radii[i, None] + radii[j])).reshape(len(q), -1).min(axis=1))
     return np.asarray(np.min(gaps, axis=0))
 
 
