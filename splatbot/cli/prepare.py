@@ -55,8 +55,6 @@ def prepare(
         overwrite: replace the scene in DIR.
         quiet: no progress and no summary, only errors.
     """
-    if frames is not None and frames < 1:
-        raise InputError(f"is {frames}.", field="--frames", hint="give 3 or more")
     if not source.exists():
         raise InputError("does not exist.", file=source, field="VIDEO|IMAGES", hint="check the path")
     check_output(out)
@@ -65,9 +63,12 @@ def prepare(
     from splatbot.cli.progress import shares
     from splatbot.run.interrupts import Interrupts
     from splatbot.training.datasets.colmap import colmap_dataset
-    from splatbot.training.datasets.photographs import collect_photographs
+    from splatbot.training.datasets.photographs import MAX_PHOTOGRAPHS, MIN_PHOTOGRAPHS, collect_photographs
     from splatbot.training.datasets.posing import find_colmap, pose_photographs
 
+    if frames is not None and not MIN_PHOTOGRAPHS <= frames <= MAX_PHOTOGRAPHS:
+        hint = f"give {MIN_PHOTOGRAPHS} to {MAX_PHOTOGRAPHS:,}"
+        raise InputError(f"is {frames:,}.", field="--frames", hint=hint)
     colmap = find_colmap()
     if matching == "auto":
         matching = "exhaustive" if source.is_dir() else "sequential"

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -58,6 +61,8 @@ def tile(
         check_new(out, overwrite=overwrite)
     if memory_mb is not None and not sweep:
         raise InputError("goes with --sweep.", field="--memory-mb", hint="give both, or leave it out")
+    if memory_mb is not None and not 0.0 < memory_mb < inf:
+        raise InputError(f"is {memory_mb:g}.", field="--memory-mb", hint="give megabytes, above 0")
 
     from splatbot.cli.progress import steps
     from splatbot.cli.tables import print_command, print_table
@@ -69,17 +74,32 @@ def tile(
     from splatbot.workspace import find_workspace
 
     scene = find_workspace(file)
-    with steps() as on_step:
+    count = TILING.tile_gaussians if tile_gaussians is None else tile_gaussians
+    if not TILING.least <= count <= TILING.most:
+        hint = f"give {TILING.least} to {TILING.most:,}"
+        raise InputError(f"is {count:,}.", field="--tile-gaussians", hint=hint)
+    with steps() as on_step, _named_as_flags():
         on_step("loading")
         model = load_gaussians(file)
         on_step("tiling")
-        count = TILING.tile_gaussians if tile_gaussians is None else tile_gaussians
         write_tiles(model, out, tile_gaussians=count, source=file.name, workspace=scene)
     print_table(describe_tiles(out), title=str(out))
     if sweep and len(model):
         _sweep(model, map, out, CONSTANTS.memory_mb if memory_mb is None else memory_mb)
     print_command(f"splatbot render {out}")
     return 0
+
+
+@contextmanager
+def _named_as_flags() -> Iterator[None]:
+    """Name the flag in errors of a value that fits no tile of this map."""
+    try:
+        yield
+    except InputError as error:
+        if error.field not in ("tile_gaussians", "memory_mb"):
+            raise
+        flag = f"--{error.field.replace('_', '-')}"
+        raise InputError(error.message, file=error.file, field=flag, hint=error.hint) from error
 
 
 def _sweep(model: GaussianModel, map_: Path, folder: Path, memory_mb: float) -> None:
@@ -92,7 +112,7 @@ def _sweep(model: GaussianModel, map_: Path, folder: Path, memory_mb: float) -> 
     from splatbot.tiles import TiledMap
     from splatbot.tiles.sweep import CONSTANTS, score_queries, score_views
 
-    with TiledMap(folder, memory_mb=memory_mb) as tiles, steps() as on_step:
+    with _named_as_flags(), TiledMap(folder, memory_mb=memory_mb) as tiles, steps() as on_step:
         on_step("reference images")
         views, source = _views(model, map_)
         on_step("views")

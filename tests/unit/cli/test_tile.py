@@ -108,8 +108,8 @@ def test_options_that_do_not_fit_are_refused(run: RunCommand, source: Path, tile
     assert_fix_named(run("info", tiled, "--fit-plane"), "--fit-plane")
     assert_fix_named(run("tile", tiled, "--out", "other"), "tiled map")
     assert_fix_named(run("tile", source, "--out", "other", "--memory-mb", 4), "--sweep")
-    assert_fix_named(run("tile", source, "--out", "other", "--tile-gaussians", 1), "tile_gaussians")
-    assert_fix_named(run("tile", source, "--out", "small", "--sweep", "--memory-mb", 0.001), "memory_mb")
+    assert_fix_named(run("tile", source, "--out", "other", "--tile-gaussians", 1), "--tile-gaussians: is 1")
+    assert_fix_named(run("tile", source, "--out", "small", "--sweep", "--memory-mb", 0.001), "--memory-mb: is 0.001 MB")
     assert_fix_named(run("tile", source, "--out", source), "--out")
 
 
@@ -133,3 +133,18 @@ def test_serve_takes_the_folder(tiled: Path) -> None:
             process.terminate()
     assert (described["gaussians"], described["source"]) == (2000, "tiles")
     assert near["distance_m"][0] < 0.5 < near["distance_m"][1]
+
+
+@pytest.mark.parametrize(
+    ("words", "mistake"),
+    [
+        (["--tile-gaussians", 3], "--tile-gaussians: is 3. Fix: give 64 to"),
+        (["--sweep", "--memory-mb", 0], "--memory-mb: is 0. Fix: give megabytes, above 0"),
+        (["--sweep", "--memory-mb", "nan"], "--memory-mb: is nan"),
+    ],
+)
+def test_a_wrong_number_is_named_with_its_flag_before_anything_is_written(
+    run: RunCommand, source: Path, words: list[object], mistake: str
+) -> None:
+    assert_fix_named(run("tile", source, "--out", "tiles", *words), mistake)
+    assert not source.with_name("tiles").exists()
