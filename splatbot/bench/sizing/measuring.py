@@ -14,7 +14,6 @@ from typing import Any
 
 import msgpack
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from splatbot.bench.benchmark import ReportProgress
@@ -57,7 +56,13 @@ def measure_costs(settings: SizingSettings, results: Results, report_progress: R
         write_tiles(model, folder / "tiles", source="simulated building")
         places = _places(settings)
         memory, read = _measure_places(folder / "tiles", places)
-        results.add("Gaussian", "memory", _memory_each(model), "byte", note="of a map in memory, with its field")
+        results.add(
+            "Gaussian",
+            "memory",
+            _memory_each(min(settings.measured, _IN_MEMORY)),
+            "byte",
+            note="of a map in memory, with its field",
+        )
         disk = sum(file.stat().st_size for file in (folder / "tiles").iterdir()) / len(model)
         report_progress("queries of the tiled map")
         requests, shared = _measure_shared(settings, results, folder / "tiles", places)
@@ -86,10 +91,10 @@ def simulated_building(count: int, seed: int = 0) -> GaussianModel:
     return replace(model, observations=model.observations + 9)
 
 
-def _memory_each(model: GaussianModel) -> float:
+def _memory_each(count: int) -> float:
     """Return the memory of a Gaussian of a map in memory, with its share of the collision field [bytes]."""
-    part = model.select(torch.arange(min(len(model), _IN_MEMORY)))
-    return (part.nbytes + GaussianCollisionField(part).nbytes) / len(part)
+    model = simulated_building(count)
+    return (model.nbytes + GaussianCollisionField(model).nbytes) / len(model)
 
 
 def _places(settings: SizingSettings) -> Array:
