@@ -49,6 +49,7 @@ LUF: Signs = (-1, -1, 1)
 Y_UP_FROM_Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """Turn (4, 4) from axes right, forward, up to axes right, up, back."""
 
+_ROUNDING = 1e-6  # of a range, above the rounding of float32
 _STRETCH = 1e-4  # largest deviation of a placed pose from a rotation times a scale
 
 
@@ -116,8 +117,9 @@ def model_of(path: str | Path, splats: SplatArrays) -> GaussianModel:
 
 
 def warn_limited(path: str | Path, name: str, values: NDArray[np.floating], low: float, high: float) -> None:
-    """Log a warning if values are outside of the range that a format stores."""
-    count = int(((values < low) | (values > high)).sum())
+    """Log a warning if values are outside of the range that a format stores, by more than float32 rounds."""
+    slack = _ROUNDING * (high - low)
+    count = int(((values < low - slack) | (values > high + slack)).sum())
     if count:
         _log.warning("%s: %d of %d %s were limited to %.3g..%.3g", path, count, values.size, name, low, high)
 

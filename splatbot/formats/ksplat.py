@@ -271,7 +271,7 @@ def _encode(path: str | Path, splats: SplatArrays, level: int, limit: float) -> 
     rest = np.concatenate([np.zeros((len(scales), 0), np.float32), *bands], axis=1)
     warn_limited(path, "colours", colors, 0.0, 1.0)
     if level > 0:
-        warn_limited(path, "scales", scales, _HALF_MIN, _HALF_MAX)
+        warn_limited(path, "logarithms of scales", splats.log_scales, np.log(_HALF_MIN), np.log(_HALF_MAX))
         scales = np.clip(scales, _HALF_MIN, _HALF_MAX)
     if level == 1:
         warn_limited(path, "harmonics", rest, -_HALF_MAX, _HALF_MAX)

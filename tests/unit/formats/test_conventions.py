@@ -134,7 +134,7 @@ def test_an_empty_model_is_refused_with_the_fix() -> None:
 
 def test_values_beyond_a_range_are_counted_in_a_warning(caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:
     with caplog.at_level(logging.WARNING):
-        warn_limited(tmp_path, "colours", np.array([0.0, 1.0]), 0.0, 1.0)
+        warn_limited(tmp_path, "colours", np.array([-1e-7, 0.0, 1.0 + 1e-7]), 0.0, 1.0)
         assert not caplog.records
         warn_limited(tmp_path, "colours", np.array([-0.1, 0.5, 2.0]), 0.0, 1.0)
     assert "2 of 3 colours were limited to 0..1" in caplog.text

@@ -147,12 +147,25 @@ def test_values_beyond_the_ranges_are_limited_with_warnings(tmp_path: Path, capl
         save_ksplat(model, tmp_path / "map.ksplat")
     assert [record.getMessage().split(": ")[1] for record in caplog.records] == [
         "1 of 15 colours were limited to 0..1",
-        "2 of 15 scales were limited to 5.96e-08..6.55e+04",
+        "2 of 15 logarithms of scales were limited to -16.6..11.1",
         "1 of 45 harmonics were limited to -6.55e+04..6.55e+04",
     ]
     back = load_ksplat(tmp_path / "map.ksplat")
     assert back.sh[0, 3, 0].item() == -65504
     assert back.scales[:2, 0].tolist() == pytest.approx([2.0**-24, 65504])
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_a_read_file_is_written_again_without_a_warning(
+    tmp_path: Path, level: Level, caplog: pytest.LogCaptureFixture
+) -> None:
+    model = detailed_model(300, degree=2)
+    model.sh[:100, 0], model.sh[100:200, 0] = 10.0, -10.0  # white and black
+    save_ksplat(model, tmp_path / "map.ksplat", level)
+    caplog.clear()
+    with caplog.at_level(logging.WARNING):
+        save_ksplat(load_ksplat(tmp_path / "map.ksplat"), tmp_path / "again.ksplat", level)
+    assert not caplog.records
 
 
 @pytest.mark.parametrize("level", LEVELS)
