@@ -35,12 +35,14 @@ class Helper:
 
     def failure(self) -> str:
         """Return how the process failed: its error or the signal that ended it; empty while it runs or succeeded."""
-        code = self.process.poll() or 0
+        code = self.process.poll()
+        if not code:
+            return ""
         if code < 0:
             return f"{self.name} was ended by {signal.Signals(-code).name}."
         lines = self.output.read_text(encoding="utf-8", errors="replace").strip().splitlines()
         last = next((line for line in reversed(lines) if line.startswith("error: ")), f"exit code {code}.")
-        return f"{self.name}: {last.removeprefix('error: ')}" if code else ""
+        return f"{self.name}: {last.removeprefix('error: ')}"
 
 
 Start = Callable[[str, Sequence[str], Path, Mapping[str, str]], Helper]
