@@ -50,7 +50,7 @@ print(json.dumps({"peak_mb": int(status["VmHWM"].split()[0]) / 1000, "cold_ms": 
 
 
 def serve(folder: Path, poses: list[Array], out: Path) -> dict[str, float]:
-    """Serve a map in a process of its own; return its largest resident set [MB], and time and processor of a query [ms]."""
+    """Serve a map in a process of its own; return its resident set [MB], and times of its first query [ms]."""
     out.mkdir()
     words = [sys.executable, "-c", SERVE, str(folder), json.dumps([T.tolist() for T in poses]), str(out)]
     done = subprocess.run(words, env={**os.environ, "OMP_NUM_THREADS": "1"}, check=True, capture_output=True)
