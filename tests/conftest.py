@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 WIDTH, HEIGHT, DEPTH_SCALE = 64, 48, 5000.0
 INTRINSICS = {"fx": 60.0, "fy": 61.0, "cx": 31.5, "cy": 23.5, "width": WIDTH, "height": HEIGHT, "depth_scale": 5000}
 
+os.environ.setdefault("DEPTHAI_SEARCH_TIMEOUT", "300")  # [ms], read when depthai is imported: there is no device
+
 MakeLog = Callable[..., Path]
 
 

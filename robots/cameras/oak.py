@@ -170,6 +170,7 @@ def _depthai() -> Any:
     os.environ.setdefault("DEPTHAI_LEVEL", "error")  # without it, depthai warns of USB in every container
     # Its signal handler would end the process where a disk is full (SIGXFSZ), which Python ignores.
     os.environ.setdefault("DEPTHAI_INSTALL_SIGNAL_HANDLER", "0")
+    os.environ.setdefault("DEPTHAI_SEARCH_TIMEOUT", "5000")  # [ms]; a device that was reset is back by then
     try:
         import depthai
     except ImportError as error:

@@ -117,6 +117,8 @@ class DeviceStreams:
 
     def __init__(self, serial: str, options: StreamOptions) -> None:
         rs = _pyrealsense()
+        if not len(rs.context().query_devices()):  # start() would wait for one for 15 s
+            raise RuntimeError("No device connected")
         self._pipeline, config = rs.pipeline(), rs.config()
         if serial:
             config.enable_device(serial)
