@@ -1,0 +1,48 @@
+"""`splatbot objects`: hand and reach of each object, and the margin of the arm."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatbot.workspace import Workspace
+from tests.terminal import at_a_terminal
+from tests.unit.cli.conftest import RunCommand, assert_fix_named
+from tests.unit.grasping.objects import model
+
+
+@pytest.fixture
+def map_file(tmp_path: Path) -> Path:
+    path = tmp_path / "map.ply"
+    model().save(path)
+    Workspace(T_world_base=np.eye(4)).save(tmp_path / "scene.yaml")
+    return path
+
+
+def test_each_word_of_the_table_has_its_meaning_and_80_columns_hold_the_table(map_file: Path) -> None:
+    shown = at_a_terminal("objects", str(map_file), "--margin", "0.3", columns=80)
+    assert shown.code == 0, shown.text
+    assert shown.longest_line() <= 80
+    text = " ".join(shown.text.split())
+    assert "in collision: each posture found for the tool at its centre meets the map or the arm" in text
+    assert "too wide: its faces are farther apart than the hand opens" in text
+    assert "margin of the arm before its hand: 300.0 mm, as given" in text
+    assert map_file.with_name("objects.png").is_file()
+
+
+def test_the_json_has_the_reach_of_each_object_and_the_margin(run: RunCommand, map_file: Path) -> None:
+    found = json.loads(run("objects", map_file, "--json").out)
+    assert {item["reach"] for item in found["objects"]} == {"yes"}
+    assert found["arm_margin_m"] == 0.0  # of a map file, which has no recording to audit
+
+
+@pytest.mark.parametrize(
+    ("margin", "mistake"),
+    [("wide", "--margin: is 'wide'"), ("-1", "--margin: is '-1'"), ("auto", "needs a run folder")],
+)
+def test_a_wrong_margin_is_refused(run: RunCommand, map_file: Path, margin: str, mistake: str) -> None:
+    assert_fix_named(run("objects", map_file, "--margin", margin), mistake)
+    assert not map_file.with_name("objects.png").exists()
