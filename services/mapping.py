@@ -7,7 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from splatbot.config import Config
+from splatbot.config import Config, with_cameras, with_sensor
 from splatbot.errors import InputError, LogError, MapNotFoundError
 from splatbot.logs import Log, open_log
 from splatbot.logs.rig import RigLog
@@ -37,8 +37,13 @@ def check_length(log: Log, settings_max: int, wanted: int | None) -> int:
 
 
 def map_recording(runtime: Runtime, served: ServedMap, log: Log, total: int) -> Work:
-    """Return the work of a job that maps the first ``total`` frames of a log into ``served``."""
-    return lambda handle: _map(runtime, served, log, total, runtime.config, handle)
+    """Return the work of a job that maps the first ``total`` frames of a log into ``served``.
+
+    Raises:
+        ConfigError: a file of the log states an unknown setting of the sensor, or a value out of range.
+    """
+    config = config_of(log, runtime.config)
+    return lambda handle: _map(runtime, served, log, total, config, handle)
 
 
 def map_upload(runtime: Runtime, served: ServedMap, archive: Path, discard: Callable[[], None]) -> Work:
@@ -49,11 +54,12 @@ def map_upload(runtime: Runtime, served: ServedMap, archive: Path, discard: Call
             try:
                 log = _unpacked(runtime.settings, archive, handle)
                 total = check_length(log, runtime.settings.max_frames, None)
+                config = config_of(log, runtime.config)
             except (InputError, OSError, JobCancelled) as error:
                 with suppress(MapNotFoundError):  # deleted meanwhile
                     runtime.store.set_state(served.id, "failed", _reason(error), generation=served.generation)
                 raise
-            return _map(runtime, served, log, total, runtime.config, handle)
+            return _map(runtime, served, log, total, config, handle)
         finally:
             discard()
 
@@ -121,6 +127,16 @@ def open_rig(uri: str) -> tuple[Log, dict[str, Workspace]]:
     return log, {
         name: one for name, one, part in by_name if not name or one.T_link_camera is not None or has_tf(part.log)
     }
+
+
+def config_of(log: Log, config: Config) -> Config:
+    """Return the configuration with the cameras and the calibrated sensor that the files of a log state.
+
+    Raises:
+        ConfigError: a file has an unknown key, or a value out of range.
+    """
+    calibration = log.calibration
+    return with_sensor(with_cameras(config, log.cameras, file=log.uri), calibration.sensor, file=calibration.file)
 
 
 def _map(

@@ -206,7 +206,7 @@ def _follow_camera(runtime: Runtime, device: str) -> None:
 def _follow_log(runtime: Runtime, log: str, camera: str | None) -> None:
     """Map a log, opened with the delay of its joints; the scene is that of the settings or of the log."""
     from splatbot.logs import open_log
-    from splatbot.services.mapping import workspace_of
+    from splatbot.services.mapping import config_of, workspace_of
     from splatbot.slam import Slam
 
     workspace = runtime.workspace or workspace_of(log, None)
@@ -214,7 +214,7 @@ def _follow_log(runtime: Runtime, log: str, camera: str | None) -> None:
     source = open_log(log, camera=camera, joint_delay=delay)
     mask = runtime.new_mask(workspace, log=source)
     served = runtime.store.add(MAP_ID, source=source.name, state="mapping", workspace=workspace, mask=mask)
-    runtime.follow(served, source, Slam(runtime.config))
+    runtime.follow(served, source, Slam(config_of(source, runtime.config)))
 
 
 def _follow_rig(runtime: Runtime, log: str, camera: str | None) -> None:
@@ -223,8 +223,7 @@ def _follow_rig(runtime: Runtime, log: str, camera: str | None) -> None:
     Raises:
         InputError: one camera is given for all recordings.
     """
-    from splatbot.config import with_cameras
-    from splatbot.services.mapping import open_rig
+    from splatbot.services.mapping import config_of, open_rig
     from splatbot.slam import Slam
 
     if camera is not None:
@@ -235,7 +234,7 @@ def _follow_rig(runtime: Runtime, log: str, camera: str | None) -> None:
     workspace = runtime.workspace or first
     mask = runtime.new_mask(workspace, further, log=source)
     served = runtime.store.add(MAP_ID, source=source.name, state="mapping", workspace=workspace, mask=mask)
-    runtime.follow(served, source, Slam(with_cameras(runtime.config, source.cameras, file=log)))
+    runtime.follow(served, source, Slam(config_of(source, runtime.config)))
 
 
 def _print_new_key(words: str | None) -> int:
