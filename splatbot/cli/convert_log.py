@@ -138,8 +138,6 @@ def _write_tum(source: Log, out: Path, depth_scale: float | None, progress: Call
 
     with _whole(out) as draft:
         sensor = source.calibration.sensor
-        record(
-            images(), draft, ground_truth=source.ground_truth, depth_scale=scale, sensor=sensor, progress=progress
-        )
+        record(images(), draft, ground_truth=source.ground_truth, depth_scale=scale, sensor=sensor, progress=progress)
     if masked:
         print_message("warning", f"the masks of {masked} frames are not written; an .mcap file holds them")
