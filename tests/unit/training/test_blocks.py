@@ -170,6 +170,9 @@ def test_two_blocks_look_as_one_scene_and_an_interrupted_training_of_them_ends_w
         _, err = process.communicate(timeout=240)
         assert process.returncode == 0, err
         assert scores_of(out)["complete"] is True
+    print(
+        f"held-out PSNR: {scores_of(undivided)['psnr_db']} dB undivided, {scores_of(whole)['psnr_db']} dB in 2 blocks"
+    )
     assert scores_of(whole)["psnr_db"] == pytest.approx(scores_of(undivided)["psnr_db"], abs=0.5)
     assert scores_of(whole)["gaussians"] == pytest.approx(scores_of(undivided)["gaussians"], rel=0.05)
     for name in ("course.png", "held_out.jpg", "progress.jsonl"):

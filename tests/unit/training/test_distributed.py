@@ -222,13 +222,13 @@ def test_ctrl_c_and_a_killed_process_end_all_and_the_training_can_be_resumed(sce
 
 def test_the_failure_of_a_helper_is_its_error_or_its_signal(tmp_path: Path) -> None:
     with started_helpers(2) as start_helper:
-        wrong = start_helper("process 1 of 2", ["train", "nowhere"], tmp_path / "1.log", {})
-        killed = start_helper("process 2 of 2", ["train", "nowhere"], tmp_path / "2.log", {})
+        wrong = start_helper("process 1 of 2", ["train"], tmp_path / "1.log", {})
+        killed = start_helper("process 2 of 2", ["train"], tmp_path / "2.log", {})
         killed.process.kill()
         killed.process.wait()
         assert killed.failure() == "process 2 of 2 was ended by SIGKILL."
         assert wrong.process.wait() == 2
-        assert re.match(r"process 1 of 2: .*nowhere.* Fix: ", wrong.failure())
+        assert re.match(r"process 1 of 2: DATASET: .* Fix: ", wrong.failure())
         unfinished = start_helper("process 3", ["help"], tmp_path / "3.log", {})
         assert unfinished.failure() == ""
     assert unfinished.process.poll() is not None
