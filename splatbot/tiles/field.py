@@ -64,10 +64,13 @@ class TiledField:
             InputError: they are invalid, or not inside the box.
         """
         self.check_inside(points)
-        found = self.field.mahalanobis(points)
+        centres = as_float64(points)
+        near = np.flatnonzero(self.field.in_collision(centres))  # all others are certainly above n_sigma
+        found = self.field.mahalanobis(centres[near])
         known = found.distance <= self.field.n_sigma
-        distance = np.where(known, found.distance, np.float32(np.inf))
-        return replace(found, distance=distance, index=np.where(known, self.rows_of(found.index), -1))
+        distance, index = np.full(len(centres), np.inf, np.float32), np.full(len(centres), -1, np.int64)
+        distance[near[known]], index[near[known]] = found.distance[known], self.rows_of(found.index[known])
+        return replace(found, distance=distance, index=index)
 
     def rows_of(self, index: NDArray[np.int64]) -> NDArray[np.int64]:
         """Map rows of the field to rows of the map; -1 stays -1."""

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from splatbot.collision import GaussianCollisionField
-from splatbot.errors import FormatError
+from splatbot.errors import FormatError, InputError
 from splatbot.gaussians import GaussianModel
 from splatbot.tiles import TiledField, TiledMap, write_tiles
 from splatbot.tiles.fields import FieldCache, FieldKey
@@ -63,6 +63,25 @@ def test_answers_of_a_shared_field_are_those_of_the_whole_map(model: GaussianMod
     inside = whole.mahalanobis(points).distance <= whole.n_sigma
     assert 0 < inside.sum() < len(points)
     np.testing.assert_array_equal(known.distance <= whole.n_sigma, inside)
+
+
+def test_mahalanobis_distances_on_the_surfaces_are_those_of_the_whole_map(model: GaussianModel, folder: Path) -> None:
+    low, high = np.array([3.0, 3.6, -0.2]), np.array([5.0, 5.5, 0.7])
+    whole = GaussianCollisionField(model)
+    rng = np.random.default_rng(1)
+    nearest = whole.clearance(rng.uniform(low, high, (4000, 3)), cut=0.5)
+    surface = nearest.witness + rng.choice((-1e-6, 1e-8, 1e-6, 1e-5), (4000, 1)) * nearest.gradient
+    surface = surface[((surface > low) & (surface < high)).all(axis=1)]
+    expected = whole.mahalanobis(surface)
+    inside = expected.distance <= whole.n_sigma
+    assert 100 < inside.sum() < len(surface) - 100
+    with TiledMap(folder) as tiles:
+        field = tiles.shared_field(low, high, reach=0.5)
+        found = field.mahalanobis(surface)
+        with pytest.raises(InputError, match=r"points"):
+            field.mahalanobis(np.column_stack([surface, np.zeros(len(surface))]))
+    np.testing.assert_array_equal(found.distance, np.where(inside, expected.distance, np.inf))
+    np.testing.assert_array_equal(found.index, np.where(inside, expected.index, -1))
 
 
 def test_shared_fields_stay_within_the_memory_and_the_latest_remain(folder: Path) -> None:
