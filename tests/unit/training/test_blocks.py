@@ -162,8 +162,8 @@ def scores_of(folder: Path) -> dict[str, float]:
 def test_two_blocks_look_as_one_scene_and_an_interrupted_training_of_them_ends_with_the_same_map(
     tmp_path: Path,
 ) -> None:
-    scene = write_wide_scene(tmp_path / "scene", points=4000, side=3.0)
-    words = (str(scene), "--iterations", "300", "--max-gaussians", "4000", "--checkpoint-every", "0.2")
+    scene = write_wide_scene(tmp_path / "scene", points=4000, side=2.5, rows=6)
+    words = (str(scene), "--iterations", "800", "--max-gaussians", "4000", "--checkpoint-every", "0.2")
     undivided, whole, cut = tmp_path / "undivided", tmp_path / "whole", tmp_path / "cut"
     for out, more in ((undivided, ()), (whole, ("--blocks", "2"))):
         process = start(*words, *more, "--out", str(out))
@@ -173,11 +173,12 @@ def test_two_blocks_look_as_one_scene_and_an_interrupted_training_of_them_ends_w
     print(
         f"held-out PSNR: {scores_of(undivided)['psnr_db']} dB undivided, {scores_of(whole)['psnr_db']} dB in 2 blocks"
     )
+    assert scores_of(undivided)["psnr_db"] > 15  # 8 dB after a step
     assert scores_of(whole)["psnr_db"] == pytest.approx(scores_of(undivided)["psnr_db"], abs=0.5)
     assert scores_of(whole)["gaussians"] == pytest.approx(scores_of(undivided)["gaussians"], rel=0.05)
     for name in ("course.png", "held_out.jpg", "progress.jsonl"):
         assert (whole / name).is_file()
-    assert len(Trajectory.load(whole / "trajectory.tum").stamps) == 14
+    assert len(Trajectory.load(whole / "trajectory.tum").stamps) == 31
     process = start(*words, "--blocks", "2", "--processes", "2", "--out", str(cut))
     until((cut / "blocks" / "1" / "checkpoint.pt").is_file)
     process.send_signal(signal.SIGINT)
