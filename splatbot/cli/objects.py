@@ -91,7 +91,7 @@ def objects(
         print(json.dumps(values, indent=2))
         return 0
     _print(found, planes)
-    if any(item.reach in ("yes", "in collision") for item in found):
+    if any(item.reach in ("yes", "blocked") for item in found):
         print_text(f"margin of the arm before its hand: {1e3 * kept:.1f} mm, {why}")
     print(f"picture: {picture}")
     return 0
@@ -151,7 +151,7 @@ def _verdicts(item: ListedObject) -> tuple[str, str]:
 _MEANINGS = {
     "fits": "the hand encloses it by its size; splatbot grasp also checks its sides and surroundings",
     "yes": "a posture of the arm takes the tool to its centre, clear of the map without the object",
-    "in collision": "each posture found for the tool at its centre meets the map or the arm; --json names the contact",
+    "blocked": "each posture found for the tool at its centre meets the map or the arm; --json names the contact",
     "no hand": "the robot has no hand; --robot takes one that has",
     "too flat": "lower than 12 mm, so that no hand encloses it",
     "too wide": "its faces are farther apart than the hand opens, less 2 mm at each pad",

@@ -48,7 +48,7 @@ class ListedObject:
         gaussians: number of Gaussians.
         on_support: whether it stands on a support of the map, and does not float or hang.
         of_hand: why the hand cannot enclose it: "no hand", "too flat" or "too wide". If None, it fits.
-        of_arm: why the arm cannot reach it: "in collision", "no pose" or "too far". If None, it can, or the robot has
+        of_arm: why the arm cannot reach it: "blocked", "no pose" or "too far". If None, it can, or the robot has
             no hand.
     """
 

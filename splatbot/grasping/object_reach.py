@@ -43,7 +43,7 @@ class Obstacle:
     """Reason why a hand cannot enclose an object, or an arm cannot reach it.
 
     Args:
-        verdict: two words.
+        verdict: a word or two.
         reason: clause with the measured values.
     """
 
@@ -139,7 +139,7 @@ def out_of_reach(
     cause = clear.cause()
     if cause is None:
         return Obstacle("no pose", "no posture places the tool at its centre from above, from the front or from a side")
-    return Obstacle("in collision", f"no posture found that places the tool at its centre is free: {cause}")
+    return Obstacle("blocked", f"no posture found that places the tool at its centre is free: {cause}")
 
 
 def _approaches(center: Array) -> list[Array]:

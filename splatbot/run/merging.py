@@ -252,11 +252,13 @@ def _check(a: SavedRun, b: SavedRun) -> None:
 
 def _write_recordings(file: Path, a: SavedRun, b: SavedRun) -> float:
     """Write the list of the two recordings, and return the time [s] by which the stamps of B are later."""
-    offset = later_by(*(stamps_of(open_log(s.place.uri, camera=s.place.camera)) for s in (a, b)))
+    addresses = [str(RunFolder(saved.folder).load_metrics()["log"]["uri"]) for saved in (a, b)]
+    cameras = [saved.place.camera for saved in (a, b)]
+    offset = later_by(*(stamps_of(open_log(log, camera=own)) for log, own in zip(addresses, cameras, strict=True)))
     entries: list[dict[str, Any]] = []
-    for saved, own in ((a, 0.0), (b, offset)):
-        camera = {} if saved.place.camera is None else {"camera": _absolute(saved.place.camera)}
-        entries.append({"log": _absolute(saved.place.uri), **camera, **({"time_offset": own} if own else {})})
+    for log, own, later in zip(addresses, cameras, (0.0, offset), strict=True):
+        camera = {} if own is None else {"camera": _absolute(own)}
+        entries.append({"log": log, **camera, **({"time_offset": later} if later else {})})
     write_text(yaml.safe_dump({"recordings": entries}, sort_keys=False))(file)
     return offset
 

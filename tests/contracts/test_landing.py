@@ -59,7 +59,7 @@ def test_the_documented_list_of_objects_has_the_fields_of_the_answer(table: Serv
     assert example.keys() == body.keys()
     assert example["planes"][0].keys() == body["planes"][0].keys()
     assert example["objects"][1].keys() == body["objects"][0].keys()
-    assert {item["reach"] for item in body["objects"]} <= {"yes", "in collision", "no pose", "too far"}
+    assert {item["reach"] for item in body["objects"]} <= {"yes", "blocked", "no pose", "too far"}
     assert (body["arm_margin_m"], body["margin_source"]) == (0.0, "unknown: the map has no recording; 0 is assumed")
 
 

@@ -14,7 +14,7 @@ import pytest
 
 from splatbot.cli.merge import pose_rows
 from splatbot.config import Config
-from splatbot.logs import open_log
+from splatbot.logs import open_log, record
 from splatbot.mapping.alignment import MapAlignment
 from splatbot.run import map_log
 from tests.terminal import at_a_terminal
@@ -126,6 +126,20 @@ def test_a_merge_that_ends_early_leaves_the_earlier_run_whole_and_a_later_one_re
     assert all("draft" not in file.read_text() for file in Path("c").glob("*.json"))
     assert json.loads(Path("c/metrics.json").read_text())["log"]["uri"] == str(Path("c/recordings.yaml").resolve())
     assert run("info", "c").code == run("diff", runs[0], "c", "--out", "d.png").code == 0
+
+
+def test_runs_of_logs_with_relative_paths_merge_in_another_folder(
+    run: RunCommand, work_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = open_log("synthetic:tabletop?frames=12&rate=6&width=160&height=120")
+    record(log, work_folder / "log")
+    for name in ("a", "b"):
+        map_log(open_log("log"), out=name, config=QUICK, save_every=1e9, report=False)
+    (work_folder / "elsewhere").mkdir()
+    monkeypatch.chdir(work_folder / "elsewhere")
+    answer = run("merge", "../a", "../b", "--out", "c", "--no-report", "--quiet")
+    assert answer.code == 0, answer.err
+    assert str(work_folder / "log") in Path("c/recordings.yaml").read_text()
 
 
 def _files(folder: str | Path) -> dict[Path, bytes]:

@@ -26,8 +26,9 @@ def test_each_word_of_the_table_has_its_meaning_and_80_columns_hold_the_table(ma
     shown = at_a_terminal("objects", str(map_file), "--margin", "0.3", columns=80)
     assert shown.code == 0, shown.text
     assert shown.longest_line() <= 80
+    assert "┃ reach" in shown.text  # a table, and not a record of each object
     text = " ".join(shown.text.split())
-    assert "in collision: each posture found for the tool at its centre meets the map or the arm" in text
+    assert "blocked: each posture found for the tool at its centre meets the map or the arm" in text
     assert "too wide: its faces are farther apart than the hand opens" in text
     assert "margin of the arm before its hand: 300.0 mm, as given" in text
     assert map_file.with_name("objects.png").is_file()

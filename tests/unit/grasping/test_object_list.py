@@ -82,10 +82,10 @@ def test_an_object_that_only_an_arm_through_the_table_reaches_is_in_collision() 
         straight = np.linalg.norm(item.at_world - shoulder)
         assert straight < 0.7
         if by_the_edge.min() > arm.chain.reach(arm.T_link_tcp):
-            assert item.reach == "in collision"
+            assert item.reach == "blocked"
             assert item.of_arm is not None
             assert "deep in the map" in item.of_arm.reason
-    assert sum(item.reach == "in collision" for item in around) >= 2
+    assert sum(item.reach == "blocked" for item in around) >= 2
 
 
 @pytest.mark.parametrize("robot", ["panda", "ur5e-2f85"])
@@ -100,7 +100,7 @@ def test_the_links_before_the_hand_keep_the_margin() -> None:
     (tool,) = {item.at_base[2] for item in list_objects(scene(), panda()) if item.label.startswith("red box")}
     assert tool + 0.11 < 0.3  # the flange is 103 mm from the tool, and so less than 0.3 m above the table
     found = list_objects(scene(), panda(), margin=0.3)
-    assert {item.reach for item in found} == {"in collision"}
+    assert {item.reach for item in found} == {"blocked"}
     assert all("or its 300.0 mm margin" in item.of_arm.reason for item in found if item.of_arm)
 
 
@@ -111,7 +111,7 @@ def test_the_plane_of_the_scene_file_is_an_obstacle_where_no_frame_saw_it() -> N
     without = objects.listed(panda(), margin=0.0, plane=None)
     assert {item.reach for item in without} == {"yes"}
     with_plane = objects.listed(panda(), margin=0.0, plane=[0.0, 0.0, 1.0, -0.28])  # 2 cm below the base
-    assert {item.reach for item in with_plane} == {"in collision"}
+    assert {item.reach for item in with_plane} == {"blocked"}
 
 
 def test_planes_name_height_and_size() -> None:
