@@ -64,7 +64,7 @@ _MAX_BYTES = 2**32 - 1  # of a section, whose header has 32 bits for them
 _TYPES = {0: ("<f4", "<f4", "<f4"), 1: ("<u2", "<f2", "<f2"), 2: ("<u2", "<f2", "u1")}  # means, shapes, harmonics
 
 
-class _Head(NamedTuple):
+class _FileHead(NamedTuple):
     major: int
     minor: int
     sections: int
@@ -79,7 +79,7 @@ class _Head(NamedTuple):
     high: float
 
 
-class _Section(NamedTuple):
+class _SectionHead(NamedTuple):
     gaussians: int
     capacity: int  # rows, of which the first ones are used
     bucket_size: int
@@ -151,7 +151,7 @@ def save_ksplat(model: GaussianModel, path: str | Path, level: Level = 1) -> Non
         splats = SplatArrays(*(values[order] for values in splats))
     limit = float(np.abs(splats.sh[:, 1:]).max(initial=0.0)) or _HARMONICS
     full = int(np.count_nonzero(lengths == BUCKET))
-    section = _Section(
+    section = _SectionHead(
         count, count, BUCKET, len(lengths), BLOCK, _CENTRE_BYTES, STEPS, 0, full, len(lengths) - full, degree
     )
     size = section.size(level)
@@ -176,11 +176,11 @@ def _row(level: int, sh_degree: int) -> np.dtype[np.void]:
     return np.dtype([*fields, ("rest", harmonic, (rest,))])
 
 
-def _read_head(path: str | Path, data: bytes) -> _Head:
+def _read_head(path: str | Path, data: bytes) -> _FileHead:
     """Return the checked header of a file."""
     if len(data) < _HEAD_BYTES:
         raise damaged(path, "header", f"{len(data)} bytes, expected {_HEAD_BYTES}")
-    head = _Head(*_HEAD.unpack_from(data))
+    head = _FileHead(*_HEAD.unpack_from(data))
     if (head.major, head.minor) != _VERSION:
         hint = "export it again with @mkkellogg/gaussian-splats-3d 0.4"
         raise FormatError(f"is {head.major}.{head.minor}, expected 0.1.", file=path, field="version", hint=hint)
@@ -195,9 +195,9 @@ def _read_head(path: str | Path, data: bytes) -> _Head:
     return head
 
 
-def _read_section(path: str | Path, data: bytes, level: int, number: int) -> _Section:
+def _read_section(path: str | Path, data: bytes, level: int, number: int) -> _SectionHead:
     """Return a section whose header agrees with itself, except for the lengths of its buckets."""
-    section = _Section(*_SECTION.unpack_from(data, _HEAD_BYTES + number * _SECTION_BYTES))
+    section = _SectionHead(*_SECTION.unpack_from(data, _HEAD_BYTES + number * _SECTION_BYTES))
     section = section._replace(steps=section.steps or STEPS)
     has_buckets = level > 0
     for field, value, is_sound in (
@@ -213,7 +213,7 @@ def _read_section(path: str | Path, data: bytes, level: int, number: int) -> _Se
 
 
 def _decode(
-    path: str | Path, data: bytes, head: _Head, section: _Section, sh_degree: int
+    path: str | Path, data: bytes, head: _FileHead, section: _SectionHead, sh_degree: int
 ) -> tuple[NDArray[np.generic], ...]:
     """Return means, quaternions, scales, colours and opacities, and harmonics beyond DC of a section."""
     rows = np.frombuffer(data, _row(head.level, section.sh_degree), section.gaussians, section.bucket_bytes)
@@ -230,7 +230,7 @@ def _decode(
     return means, rows["quat"], rows["scale"], rows["rgba"], harmonics
 
 
-def _centres(path: str | Path, data: bytes, section: _Section) -> NDArray[np.float32]:
+def _centres(path: str | Path, data: bytes, section: _SectionHead) -> NDArray[np.float32]:
     """Return the centre of the bucket of each row (capacity, 3)."""
     others = np.frombuffer(data, "<u4", section.other_buckets)
     centres = np.frombuffer(data, "<f4", 3 * section.buckets, others.nbytes).reshape(-1, 3)

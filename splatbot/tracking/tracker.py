@@ -35,7 +35,8 @@ Array = NDArray[np.float64]
 _MIN_GRAY_STD = 0.005
 
 _BEFORE_START = 0.03  # [s] from the pose by which a first frame in motion has its velocity, to this frame
-_MAX_RECTIFICATIONS = 2  # by the velocity that the pose implies; each halves the error of the velocity at least
+_WORSE = 1.1  # times the residual of the last alignment: a rectification by a wrong velocity
+_MAX_RECTIFICATIONS = 6  # by the velocity that the pose implies; each halves the error of the velocity at least
 
 
 class Tracker:
@@ -187,16 +188,16 @@ class Tracker:
     ) -> ScoredHypothesis:
         """Align the frame again, rectified by the velocity that its pose implies, until its rows stay in place."""
         sensor = self.config.sensor
-        predicted = self._filter.predict(problem.prepared.frame.stamp)
-        if predicted is None or best.verdict == "lost":
-            return best
+        predicted = self._predicted(problem.prepared.frame.stamp, best)
         for _ in range(_MAX_RECTIFICATIONS):
             prepared = problem.prepared
             twist = self._measured(predicted, best, prepared).twist
             if displacement(prepared, twist, sensor) < MIN_DISPLACEMENT:
                 break
             again = scheduler.align_again(prepare(prepared.recorded, self.config, twist), best)
-            if again.verdict == "lost":  # the velocity is wrong
+            if again is best:  # no time is left
+                break
+            if again.health.score > _WORSE * best.health.score:  # the velocity is wrong
                 problem.replace_images(prepared, best.T_world_camera)
                 break
             best = again
@@ -231,18 +232,18 @@ class Tracker:
         """
         if pose.verdict == "lost":
             return pose, uncertainty
-        stamp, T = prepared.frame.stamp, pose.T_world_camera
-        predicted = self._filter.predict(stamp)
-        if predicted is None:
-            self._filter.update(CameraMotion.at_pose(stamp, T, self.variance_scale * pose.covariance))
-            return pose, uncertainty
-        state = self._measured(predicted, pose if robot_prior is not None else best, prepared)
+        measured = pose if robot_prior is not None else best
+        state = self._measured(self._predicted(prepared.frame.stamp, measured), measured, prepared)
         self._filter.update(state)
         if robot_prior is not None:
             return pose, uncertainty
         against_keyframes = state.covariance[:6, :6] / self.variance_scale  # the uncertainty is scaled again
         pose = pose.with_pose(state.T_world_camera, against_keyframes)
         return pose, self._uncertainty(pose)
+
+    def _predicted(self, stamp: float, pose: ScoredHypothesis) -> CameraMotion:
+        """Return the predicted motion; after a loss or a long gap it is unknown, and the rows alone measure it."""
+        return self._filter.predict(stamp) or CameraMotion.at_pose(stamp, pose.T_world_camera, np.eye(6))
 
     def _measured(self, predicted: CameraMotion, pose: ScoredHypothesis, prepared: PreparedFrame) -> CameraMotion:
         """Return the state of the motion after the measurement of a pose, and of its rows if no direction is weak."""
