@@ -59,6 +59,7 @@ _SECTION = struct.Struct("<IIIIfHxxIIIIHxx")
 _HEAD_BYTES, _SECTION_BYTES, _CENTRE_BYTES = 4096, 1024, 12
 _VERSION = (0, 1)
 _HARMONICS = 1.5  # end of the range of level 2 if the header has 0
+_TINY = 2.0**-126  # smallest normal float32
 _HALF_MIN, _HALF_MAX = 2.0**-24, 65504.0  # of float16
 _MAX_BYTES = 2**32 - 1  # of a section, whose header has 32 bits for them
 _TYPES = {0: ("<f4", "<f4", "<f4"), 1: ("<u2", "<f2", "<f2"), 2: ("<u2", "<f2", "u1")}  # means, shapes, harmonics
@@ -136,8 +137,8 @@ def save_ksplat(model: GaussianModel, path: str | Path, level: Level = 1) -> Non
 
     Errors are at most 1/510 for colours (0..1) and opacities. Level 0 stores all other values as float32, in order.
     Levels 1 and 2 sort Gaussians by cubes of 5 m. Errors of positions are at most 0.04 mm, plus the rounding of float32
-    beyond 500 m. Scales, quaternions and harmonics are float16. Level 2 has 255 steps for harmonics, from the negative
-    of the largest magnitude to itself.
+    beyond 500 m. Scales, quaternions and harmonics are float16. Level 2 has 255 steps for harmonics within the range
+    of their values, and zero is exact to the rounding of float32.
 
     Raises:
         InputError: the model is empty, a value is not finite, or the section exceeds 4 GiB.
@@ -149,7 +150,7 @@ def save_ksplat(model: GaussianModel, path: str | Path, level: Level = 1) -> Non
     else:
         order, centres, lengths = _fill_buckets(splats.means)
         splats = SplatArrays(*(values[order] for values in splats))
-    limit = float(np.abs(splats.sh[:, 1:]).max(initial=0.0)) or _HARMONICS
+    low, high = _range_of(splats.sh[:, 1:])
     full = int(np.count_nonzero(lengths == BUCKET))
     section = _SectionHead(
         count, count, BUCKET, len(lengths), BLOCK, _CENTRE_BYTES, STEPS, 0, full, len(lengths) - full, degree
@@ -158,9 +159,9 @@ def save_ksplat(model: GaussianModel, path: str | Path, level: Level = 1) -> Non
     if size > _MAX_BYTES:
         hint = "write level 1 or 2, or split the scene"
         raise InputError(f"takes {size:,} bytes, at most {_MAX_BYTES:,}.", file=path, field="model", hint=hint)
-    rows = _encode(path, splats, level, limit)
+    rows = _encode(path, splats, level, low, high)
     rows["mean"] = splats.means if level == 0 else _to_codes(splats.means, np.repeat(centres, lengths, axis=0))
-    head = _HEAD.pack(*_VERSION, 1, 1, count, count, level, 0.0, 0.0, 0.0, -limit, limit)
+    head = _HEAD.pack(*_VERSION, 1, 1, count, count, level, 0.0, 0.0, 0.0, low, high)
     with atomic_write(path) as file:
         file.write(head.ljust(_HEAD_BYTES, b"\0"))
         file.write(_SECTION.pack(*section._replace(bytes=size)).ljust(_SECTION_BYTES, b"\0"))
@@ -263,8 +264,21 @@ def _to_codes(means: Table, centres: Table) -> Array:
     return np.clip(np.rint(offsets * (2 * STEPS / BLOCK)) + STEPS, 0, 2 * STEPS + 1)
 
 
-def _encode(path: str | Path, splats: SplatArrays, level: int, limit: float) -> NDArray[np.void]:
-    """Return rows whose means are not yet set; ``limit``: the largest magnitude of harmonics of level 2."""
+def _range_of(harmonics: Table) -> tuple[float, float]:
+    """Return the ends of 255 steps, one of which ends at zero. Values are at most half a step beyond them.
+
+    An end at zero is a tiny number, because 0 in the header means the default.
+    """
+    least, most = float(harmonics.min(initial=0.0)), float(harmonics.max(initial=0.0))
+    if least == most:
+        least, most = -_HARMONICS, _HARMONICS
+    step = (most - least) / 255
+    below = round(-least / step)
+    return -below * step or -_TINY, (255 - below) * step or _TINY
+
+
+def _encode(path: str | Path, splats: SplatArrays, level: int, low: float, high: float) -> NDArray[np.void]:
+    """Return rows whose means are not yet set; ``low`` and ``high``: ends of the harmonics of level 2."""
     degree = round(splats.sh.shape[1] ** 0.5) - 1
     colors, scales = colors_of(splats.sh), linear_scales(splats.log_scales)
     bands = [to_channel_major(splats.sh[:, n**2 - 1 : (n + 1) ** 2]) for n in range(1, degree + 1)]
@@ -280,5 +294,5 @@ def _encode(path: str | Path, splats: SplatArrays, level: int, limit: float) -> 
     rows["scale"], rows["quat"] = scales, splats.quats
     rows["rgba"][:, :3] = to_steps(colors, 0.0, 1.0, 255)
     rows["rgba"][:, 3] = to_steps(sigmoid(splats.opacity_logits), 0.0, 1.0, 255)
-    rows["rest"] = to_steps(rest, -limit, limit, 255) if level == 2 else rest
+    rows["rest"] = to_steps(rest, low, high, 255) if level == 2 else rest
     return rows

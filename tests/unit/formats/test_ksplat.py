@@ -173,7 +173,19 @@ def test_harmonics_of_zero_stay_zero(tmp_path: Path, level: Level) -> None:
     model = detailed_model(5, degree=2)
     model.sh[:, 1:] = 0.0
     save_ksplat(model, tmp_path / "map.ksplat", level)
-    assert load_ksplat(tmp_path / "map.ksplat").sh[:, 1:].abs().max() <= 1.5 / 255 + ROUNDING
+    assert load_ksplat(tmp_path / "map.ksplat").sh[:, 1:].abs().max() <= ROUNDING
+
+
+@pytest.mark.parametrize("values", [(0.3,), (-0.3,), (0.3, -0.3), (0.3, -0.01), (0.01, -0.3)])
+def test_zero_harmonics_stay_zero_next_to_others(tmp_path: Path, values: tuple[float, ...]) -> None:
+    model = detailed_model(5, degree=2)
+    model.sh[:, 1:] = 0.0
+    for row, value in enumerate(values):
+        model.sh[row, 1, 0] = value
+    save_ksplat(model, tmp_path / "map.ksplat", 2)
+    back = load_ksplat(tmp_path / "map.ksplat")
+    assert back.sh[model.sh == 0.0].abs().max() <= ROUNDING
+    assert errors(back.sh[:, 1:], model.sh[:, 1:]).max() <= (max(*values, 0.0) - min(*values, 0.0)) / 510 + ROUNDING
 
 
 def test_a_section_beyond_4_gib_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
