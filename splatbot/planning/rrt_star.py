@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -108,6 +109,7 @@ class GaussianRRTStar:
         self._native = self._planner(eps)
         self._goals: Array | None = None  # of the last search
         self._searching = threading.Lock()
+        self._cancelled = threading.Event()  # kept until a search ends, for _prepare replaces the native planner
 
     @property
     def field(self) -> GaussianCollisionField:
@@ -171,7 +173,8 @@ class GaussianRRTStar:
         self._goals = goals.q
         before = time.perf_counter() - begin
         left = _for_search(budget_ms, before)
-        end = self._native.run(q, goals.q, left, 2**62 if iterations is None else iterations, seed, 0.0)
+        most = 2**62 if iterations is None else iterations
+        end = self._search(lambda native: native.run(q, goals.q, left, most, seed, 0.0))
         return self._result(end, q, goals.q, before, begin, begin + 1e-3 * budget_ms)
 
     def solve(
@@ -230,7 +233,8 @@ class GaussianRRTStar:
         added = field.added_since(before)
         spent = time.perf_counter() - begin
         left = _for_search(budget_ms, spent)
-        end = self._native.rerun(q, field.native, added.native, self.arm.without_pairs.native, left, 2**62, seed)
+        arm = self.arm.without_pairs.native
+        end = self._search(lambda native: native.rerun(q, field.native, added.native, arm, left, 2**62, seed))
         return self._result(end, q, goals.q, spent, begin, begin + 1e-3 * budget_ms)
 
     def clearance_to(self, field: GaussianCollisionField, waypoints: Array, cut: float, eps: float) -> float | None:
@@ -246,7 +250,11 @@ class GaussianRRTStar:
         )
 
     def cancel(self) -> None:
-        """End the search of another thread's :meth:`plan`, which returns the best path so far, or PREEMPTED."""
+        """End the search of another thread's :meth:`plan`, which returns the best path so far, or PREEMPTED.
+
+        A cancel before the search begins ends it as well.
+        """
+        self._cancelled.set()
         self._native.cancel()
 
     def best(self) -> tuple[Array, float, NDArray[np.float64]]:
@@ -323,6 +331,14 @@ class GaussianRRTStar:
         eps = max(CONSTANTS.min_eps, min(self.eps, clearance / 4))
         if eps != self._eps:
             self._eps, self._native = eps, self._planner(eps)
+
+    def _search(self, run: Callable[[ArmPlanner], int]) -> int:
+        """Run the native planner, which a cancel during the preparation ends at once; return how it ended."""
+        if self._cancelled.is_set():
+            self._native.cancel()
+        end = run(self._native)
+        self._cancelled.clear()
+        return end
 
     def _result(self, end: int, start: Array, goals: Array, before: float, begin: float, until: float) -> PlanResult:
         status = _STATUS[end]

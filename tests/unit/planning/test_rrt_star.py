@@ -173,12 +173,15 @@ def test_several_threads_may_ask_one_planner(planner: GaussianRRTStar) -> None:
         np.testing.assert_array_equal(found[k], alone[k])
 
 
-def test_a_cancelled_search_without_a_path_says_so(ball: GaussianCollisionField) -> None:
+@pytest.mark.parametrize("start", [-0.8, -0.2202])
+def test_a_cancelled_search_without_a_path_says_so(ball: GaussianCollisionField, start: float) -> None:
+    """A start close to the ball makes the planner choose a smaller eps once the goal is known."""
     planner = GaussianRRTStar(ball, Slider(2))
     planner.cancel()
-    result = planner.plan([-0.8, 0.0], [0.8, 0.0])
+    result = planner.plan([start, 0.0], [0.8, 0.0])
     assert result.status is PlanStatus.PREEMPTED
     assert not result
+    assert planner.plan([start, 0.0], [0.8, 0.0]).status is PlanStatus.SUCCESS
 
 
 def test_failures_name_what_is_in_the_way(planner: GaussianRRTStar, field: GaussianCollisionField) -> None:
