@@ -20,7 +20,7 @@ _ANSWER = {
     "map_version": 12,
     "hand_opens_m": 0.08,
     "arm_margin_m": 0.006,
-    "margin_source": "audited error of the map where the arm moves",
+    "margin_source": "audited error of the map around the objects",
     "planes": [
         {
             "label": "support",
@@ -77,7 +77,9 @@ def objects(request: Request, served: Served, robot: Annotated[str, Depends(_rob
         raise InputError("has no hand.", field="robot", hint="name a robot with a gripper, as panda")
     found = objects_in(served, np.asarray(base_in(served, None)), as_known=True)
     source = margin_source(served, None)
-    margin = source.margin if source.error is None else found.error_around(source.error)
+    margin, why = source.margin, source.why
+    if source.error is not None:
+        margin, why = found.error_around(source.error), "audited error of the map around the objects"
     plane = None if served.workspace is None else served.workspace.support_plane
 
     def listed() -> tuple[ListedObject, ...]:
@@ -87,8 +89,8 @@ def objects(request: Request, served: Served, robot: Annotated[str, Depends(_rob
         "map_version": served.map_version,
         "hand_opens_m": stroke_of(arm),
         "arm_margin_m": margin,
-        "margin_source": source.why,
+        "margin_source": why,
         "planes": list_planes(found.scene),
-        "objects": [item.to_dict() for item in served.derived.get(("listed objects", arm.name), listed)],
+        "objects": [item.to_dict() for item in served.derived.get(("listed objects", arm.name, margin), listed)],
     }
     return answer(request, body)

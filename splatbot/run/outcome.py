@@ -154,5 +154,6 @@ class RunOutcome:
 
 
 def _absolute(uri: str) -> str:
-    """Return an existing path as an absolute one, which is valid in other working directories; other URIs as is."""
-    return str(Path(uri).resolve()) if Path(uri).exists() else uri
+    """Return an address whose path exists with its absolute path, valid in other working directories; others as is."""
+    path, mark, options = (uri, "", "") if Path(uri).exists() else uri.partition("?")
+    return f"{Path(path).resolve()}{mark}{options}" if Path(path).exists() else uri

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from splatbot.gaussians import Snapshot
+from splatbot.results.margin import AuditedError
+from splatbot.services.margins import MarginSource
 from splatbot.services.settings import ServiceSettings
 from splatbot.workspace import Workspace
 from tests.contracts.conftest import Service, running
@@ -50,6 +52,18 @@ def test_objects_name_their_unit_and_what_does_not_fit_the_hand(table: Service) 
         _, short, height = item["size_m"]
         assert item["graspable_by_size"] == (short <= 0.076 and height >= 0.012)
         assert short <= 0.076 or "the hand opens 80 mm" in item["obstacle"]
+
+
+def test_objects_are_listed_with_the_margin_of_each_request(table: Service, monkeypatch: pytest.MonkeyPatch) -> None:
+    points = np.zeros((1000, 3))
+    for error in (0.0, 0.3):
+        source = MarginSource(AuditedError(points, np.full(1000, error)), 0.0, "audited")
+        monkeypatch.setattr("splatbot.services.routes.objects.margin_source", lambda *_, source=source: source)
+        body = table.client.get("/v1/maps/desk/objects").json()
+        assert body["arm_margin_m"] == pytest.approx(error)
+        assert body["margin_source"] == "audited error of the map around the objects"
+        keeps = ["or its 300.0 mm margin" in item["obstacle"] for item in body["objects"]]
+        assert keeps == [error > 0.0] * 2
 
 
 def test_the_documented_list_of_objects_has_the_fields_of_the_answer(table: Service) -> None:

@@ -133,13 +133,15 @@ def test_runs_of_logs_with_relative_paths_merge_in_another_folder(
 ) -> None:
     log = open_log("synthetic:tabletop?frames=12&rate=6&width=160&height=120")
     record(log, work_folder / "log")
-    for name in ("a", "b"):
-        map_log(open_log("log"), out=name, config=QUICK, save_every=1e9, report=False)
+    for name, address in (("a", "log"), ("b", "log?pair_within=0.05")):
+        map_log(open_log(address), out=name, config=QUICK, save_every=1e9, report=False)
     (work_folder / "elsewhere").mkdir()
     monkeypatch.chdir(work_folder / "elsewhere")
     answer = run("merge", "../a", "../b", "--out", "c", "--no-report", "--quiet")
     assert answer.code == 0, answer.err
-    assert str(work_folder / "log") in Path("c/recordings.yaml").read_text()
+    recordings = Path("c/recordings.yaml").read_text().splitlines()
+    assert f"- log: {work_folder / 'log'}" in recordings
+    assert f"- log: {work_folder / 'log'}?pair_within=0.05" in recordings
 
 
 def _files(folder: str | Path) -> dict[Path, bytes]:
