@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,14 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from splatbot.errors import InputError
+from splatbot.atomic import sweep_drafts
+from splatbot.errors import FormatError, InputError
 from splatbot.formats.ply import save_ply
 from splatbot.gaussians import GaussianModel
 from splatbot.training.blocks import SceneBlock, cut_scene, merged, start_of
 from splatbot.training.datasets import TrainingData
 from splatbot.training.folder import ProgressRow, TrainingFolder, TrainingSettings
 from splatbot.training.helpers import Helper, check_helpers, started_helpers
-from splatbot.training.images import ImageCache, check_memory
+from splatbot.training.images import ImageCache, check_memory, pixels
 from splatbot.training.initialize import initial_model
 from splatbot.training.scoring import score_held_out, summary
 from splatbot.training.session import CONSTANTS, Pictures
@@ -61,8 +61,9 @@ class BlockTraining:
         self.data = data
         self.folder = folder
         self.train, self.held_out = data.split(settings.held_out_every)
-        pixels = sum(view.camera.width * view.camera.height for view in self.train)
-        self.settings = replace(settings, options=settings.options.capped(pixels))
+        self.settings = replace(settings, options=settings.options.capped(pixels(self.train)))
+        if resume:
+            sweep_drafts(folder.path)
         if not (resume and folder.blocks.exists()):
             self._cut(start, resume=resume)
 
@@ -72,13 +73,12 @@ class BlockTraining:
         if start is None:
             assert options.max_gaussians is not None
             if not len(self.data.points):
-                check_memory(self.data)  # random points need the images
+                check_memory(self.data.folder, self.train)  # random points need the images
             start = initial_model(self.data, ImageCache(self.train), most=options.max_gaussians, seed=options.seed)
         blocks = cut_scene(start.means.double().numpy(), self.train, self.settings.blocks)
         if not resume:
             self.folder.begin(self.settings)
         draft = self.folder.path / ".blocks.draft"
-        shutil.rmtree(draft, ignore_errors=True)
         for number, block in enumerate(blocks):
             part, of_block = TrainingFolder(draft / str(number)), start_of(start, block, self.train, options.seed)
             part.begin(self._settings_of(block, len(of_block) / len(start)))
@@ -121,11 +121,14 @@ class BlockTraining:
 
         Raises:
             LostProcessError: the process of a block failed.
+            InputError: the images of the blocks that train at the same time do not fit into memory.
         """
         more = ["--quiet", "--checkpoint-every", str(checkpoint_s), *(() if log is None else ("--log", log))]
         waiting = [part for part in self._parts if not _is_complete(part)]
         running: list[Helper] = []
-        with started_helpers(at_once) as start:
+        at_once = min(at_once, len(waiting))
+        self._check_views(waiting, at_once, report)
+        with started_helpers(max(1, at_once)) as start:
             while waiting or running:
                 if stop():
                     for helper in running:
@@ -146,10 +149,20 @@ class BlockTraining:
                 time.sleep(_POLL_S)
         return True
 
+    def _check_views(self, waiting: list[TrainingFolder], at_once: int, report: Callable[[str], None]) -> None:
+        """Check the memory of the largest blocks that can train at the same time, and report views that train none."""
+        names = {part.path: set(_block_of(part).views) for part in self._parts}
+        missing = {view.name for view in self.train}.difference(*names.values())
+        if missing:
+            report(f"{len(missing)} of {len(self.train)} views see no point of the start, and train no block")
+        held = [[view for view in self.train if view.name in names[part.path]] for part in waiting]
+        check_memory(self.data.folder, *sorted(held, key=pixels, reverse=True)[:at_once])
+
     def merge(self) -> GaussianModel:
         """Return the map of all blocks, and save it with the poses of its images."""
-        blocks = [(part.load_settings().block, part) for part in self._parts]
-        model = merged([(block, part.map) for block, part in blocks if block is not None])
+        keeps_rows = self.settings.options.strategy == "fixed"
+        parts = [(_block_of(part), part.map, part.start if keeps_rows else None) for part in self._parts]
+        model = merged(parts)
         poses = np.stack([view.T_world_camera for view in self.train])
         self.folder.save_map(model, Trajectory(np.arange(float(len(poses))), poses))
         return model
@@ -178,6 +191,15 @@ class BlockTraining:
         row = ProgressRow(result["iterations"], result["seconds"], loss, result["psnr_db"], len(model))
         self.folder.save_scores([row], result, pictures([row], scores))
         return result
+
+
+def _block_of(part: TrainingFolder) -> SceneBlock:
+    block = part.load_settings().block
+    if block is None:
+        raise FormatError(
+            "is no block of a scene.", file=part.settings, field="block", hint="train again (--overwrite)"
+        )
+    return block
 
 
 def _is_complete(part: TrainingFolder) -> bool:

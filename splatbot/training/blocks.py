@@ -1,7 +1,8 @@
 """Blocks of a scene along a kd-tree, each trained apart, as in VastGaussian (Lin et al. 2024).
 
-A block owns the Gaussians whose centres lie inside. It trains them with those of a margin, and with every eighth of the
-others that its views see. Both explain the rest of its images, and are dropped at the merge.
+A block owns the Gaussians whose centres lie inside, at the start where training keeps all, else at the end. It trains
+them with those of a margin, and with every eighth of the others that its views see. Both explain the rest of its images,
+and are dropped at the merge.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from splatbot.errors import InputError
+from splatbot.errors import FormatError, InputError
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import inverse
 from splatbot.training.datasets import TrainingView
@@ -91,19 +92,22 @@ def cut_scene(points: Array, views: Sequence[TrainingView], count: int) -> list[
         count: number of blocks.
 
     Raises:
-        InputError: the number is out of range, or no view shows enough of a block.
+        InputError: the number is out of range, too many points lie in one place, or no view shows enough of a block.
     """
     if not 2 <= count <= min(CONSTANTS.most, len(points)):
         most = min(CONSTANTS.most, len(points))
         raise InputError(f"is {count} for {len(points)} points.", field="--blocks", hint=f"give 1 to {most}")
     leaves = [SceneBlock(cuts, CONSTANTS.margin * _side(inside), ()) for cuts, inside in _halve(points, count)]
-    near = [leaf.holds(points, leaf.margin) for leaf in leaves]
     names: list[list[str]] = [[] for _ in leaves]
     for view in views:
-        seen = in_view(view, points)
-        for chosen, inside in zip(names, near, strict=True):
-            if np.count_nonzero(seen & inside) > CONSTANTS.least_share * np.count_nonzero(seen):
-                chosen.append(view.name)
+        seen = points[in_view(view, points)]
+        if not len(seen):
+            continue
+        held = np.array([np.count_nonzero(leaf.holds(seen, leaf.margin)) for leaf in leaves])
+        trained = held > CONSTANTS.least_share * len(seen)
+        trained[np.argmax(held)] = True
+        for number in np.flatnonzero(trained):
+            names[number].append(view.name)
     if not all(names):
         hint = "use fewer blocks, or add views"
         raise InputError(
@@ -134,13 +138,17 @@ def start_of(model: GaussianModel, block: SceneBlock, views: Sequence[TrainingVi
     return GaussianModel.concatenate([model.select(torch.from_numpy(near)), sparse])
 
 
-def merged(parts: Sequence[tuple[SceneBlock, Path]]) -> GaussianModel:
-    """Return the Gaussians of trained blocks, each of the block that owns its place.
+def merged(parts: Sequence[tuple[SceneBlock, Path, Path | None]]) -> GaussianModel:
+    """Return the Gaussians of trained blocks, each of the block that owns it.
 
     Maps are read one at a time, and twice: memory then holds the result and one block.
 
     Args:
-        parts: each block and the file of its map.
+        parts: each block, the file of its map, and that of its start if training keeps its rows. A Gaussian that
+            crosses a cut then keeps its owner, so that none is lost or doubled. Without it, the trained place counts.
+
+    Raises:
+        FormatError: a map has another number of Gaussians than its start.
     """
     sizes = [(len(part), part.sh.shape[1]) for part in map(_owned, parts)]
     count, bands = sum(rows for rows, _ in sizes), max(bands for _, bands in sizes)
@@ -155,10 +163,14 @@ def merged(parts: Sequence[tuple[SceneBlock, Path]]) -> GaussianModel:
     return whole
 
 
-def _owned(part: tuple[SceneBlock, Path]) -> GaussianModel:
-    block, file = part
+def _owned(part: tuple[SceneBlock, Path, Path | None]) -> GaussianModel:
+    block, file, start = part
     model = GaussianModel.load(file)
-    return model.select(torch.from_numpy(block.holds(model.means.double().numpy())))
+    places = model.means if start is None else GaussianModel.load(start).means
+    if len(places) != len(model):
+        hint = "train the block again: remove its checkpoint.pt and scores.json, then --resume"
+        raise FormatError(f"has {len(model)} Gaussians, its start {len(places)}.", file=file, hint=hint)
+    return model.select(torch.from_numpy(block.holds(places.double().numpy())))
 
 
 def in_view(view: TrainingView, points: Array) -> Mask:
@@ -174,15 +186,39 @@ def _halve(points: Array, count: int) -> list[tuple[tuple[Cut, ...], Array]]:
     """Return the cuts and the points of each leaf of a kd-tree with ``count`` leaves."""
     if count == 1:
         return [((), points)]
-    axis = int(np.argmax(_sides(points)))
     below = count // 2
-    place = float(np.quantile(points[:, axis], below / count))
+    axis, place = _plane(points, below, count - below)
     above = points[:, axis] >= place
     return [
         ((Cut(axis, place, side), *cuts), inside)
         for side, part, share in ((False, points[~above], below), (True, points[above], count - below))
         for cuts, inside in _halve(part, share)
     ]
+
+
+def _plane(points: Array, below: int, above: int) -> tuple[int, float]:
+    """Return axis and place of the cut that gives each leaf a share of the points, across the longest axis that can.
+
+    Args:
+        points: (M, 3) to cut.
+        below, above: number of leaves of each side; a side has at least as many points.
+
+    Raises:
+        InputError: no axis has a cut.
+    """
+    share = below / (below + above)
+    for axis in np.argsort(-_sides(points), kind="stable"):
+        x = np.sort(points[:, axis])
+        middle = float(np.quantile(x, share))
+        places = np.append(middle, np.unique(x))  # the nearest to the middle where many points share a coordinate
+        smaller = np.searchsorted(x, places)
+        allowed = (smaller >= below) & (len(x) - smaller >= above)
+        if allowed[0]:
+            return int(axis), middle
+        if allowed.any():
+            away = np.where(allowed, np.abs(smaller - share * len(x)), np.inf)
+            return int(axis), float(places[np.argmin(away)])
+    raise InputError("is too large: too many points lie in one place.", field="--blocks", hint="use fewer blocks")
 
 
 def _sides(points: Array) -> Array:

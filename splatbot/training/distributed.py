@@ -40,10 +40,12 @@ class TrainingGroup:
     Args:
         rank: number of this process, from 0; process 0 decides and writes.
         size: number of processes.
+        local: number of processes of its machine if it is the first of them, else 0.
     """
 
     rank: int = 0
     size: int = 1
+    local: int = 1
 
     @property
     def leads(self) -> bool:
@@ -108,14 +110,16 @@ def planned_group(processes: int) -> TrainingGroup:
     if not 1 <= processes <= _MOST_PROCESSES:
         raise InputError(f"is {processes}.", field="--processes", hint=f"give 1 to {_MOST_PROCESSES}")
     if not _is_member():
-        return TrainingGroup(0, processes)
+        return TrainingGroup(0, processes, processes)
     if processes > 1:
         raise InputError(f"is {processes} under torchrun.", field="--processes", hint="leave it out")
     rank, size = os.environ["RANK"], os.environ["WORLD_SIZE"]
     if not (rank.isdecimal() and size.isdecimal() and int(rank) < int(size)):
         hint = "start the processes by torchrun"
         raise InputError(f"is process {rank!r} of {size!r}.", field="RANK, WORLD_SIZE", hint=hint)
-    return TrainingGroup(int(rank), int(size))
+    of_file = os.environ["MASTER_ADDR"].startswith(_FILE)  # the process that started this one counts for it
+    first = not of_file and os.environ.get("LOCAL_RANK", "0") == "0"
+    return TrainingGroup(int(rank), int(size), int(os.environ.get("LOCAL_WORLD_SIZE", "1")) if first else 0)
 
 
 @contextmanager

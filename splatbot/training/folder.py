@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from splatbot.atomic import atomic_write, replace_files, write_bytes, write_text
+from splatbot.atomic import atomic_write, replace_files, sweep_drafts, write_bytes, write_text
 from splatbot.errors import FormatError, InputError
 from splatbot.formats.ply import save_ply
 from splatbot.gaussians import GaussianModel
@@ -24,6 +24,7 @@ from splatbot.training.options import TrainingOptions
 from splatbot.trajectory import Trajectory
 
 _FORMAT = 1
+_PICTURES = ("course.png", "held_out.jpg")
 _HINT = "give a folder that `splatbot train` wrote"
 
 
@@ -82,15 +83,19 @@ class TrainingFolder:
         self.blocks = self.path / "blocks"
 
     def begin(self, settings: TrainingSettings) -> None:
-        """Create the folder for a new training; the checkpoint and the blocks of an earlier one are removed.
+        """Create the folder for a new training; all files of an earlier one are removed.
 
         Raises:
             InputError: the folder cannot be written.
         """
         try:
             self.path.mkdir(parents=True, exist_ok=True)
-            self.checkpoint.unlink(missing_ok=True)
-            shutil.rmtree(self.blocks, ignore_errors=True)
+            sweep_drafts(self.path)
+            pictures = [self.path / name for name in _PICTURES]
+            for file in (self.scores, self.checkpoint, self.map, self.trajectory, self.progress, *pictures):
+                file.unlink(missing_ok=True)
+            if self.blocks.exists():
+                shutil.rmtree(self.blocks)
             self.save_settings(settings)
         except OSError as error:
             hint = "name another folder"

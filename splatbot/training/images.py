@@ -14,7 +14,7 @@ from torch import Tensor
 
 from splatbot.camera import Camera
 from splatbot.errors import InputError
-from splatbot.training.datasets import TrainingData, TrainingView
+from splatbot.training.datasets import TrainingView
 from splatbot.training.datasets.images import resample, scaled, scaled_depth, scaled_mask
 
 _LEAST_SIDE = 96  # [px] smaller images are not reduced further
@@ -92,20 +92,31 @@ class ImageCache:
         return small, mask, None if depth is None else torch.from_numpy(scaled_depth(depth.numpy(), size))
 
 
-def check_memory(data: TrainingData) -> None:
-    """Check that the images of a dataset fit into the free memory: 4 bytes a pixel, 4 more of depth, and smaller sizes.
+def pixels(views: Sequence[TrainingView]) -> int:
+    """Return the number of pixels of views in all."""
+    return sum(view.camera.width * view.camera.height for view in views)
+
+
+def check_memory(folder: Path, *held: Sequence[TrainingView]) -> None:
+    """Check that images fit into the free memory: 4 bytes a pixel, 4 more of depth, and smaller sizes.
+
+    Args:
+        folder: of the dataset.
+        held: views of each process of this machine that reads them; over a run, a process holds all of its views.
 
     Raises:
         InputError: they do not.
     """
-    each = 8 if any(view.read_depth is not None for view in data.views) else 4
-    needed = 4 / 3 * each * sum(view.camera.width * view.camera.height for view in data.views)
+    each = 8 if any(view.read_depth is not None for views in held for view in views) else 4
+    needed = 4 / 3 * each * sum(map(pixels, held))
     free = _free_memory()
     if free is not None and needed > 0.7 * free:
         least = math.ceil(math.sqrt(needed / (0.7 * free)))
         hint = f"reduce the images: --scale {2 ** math.ceil(math.log2(least))}, times a scale already given"
-        why = f"needs {needed / 1e9:.1f} GB for its images, and {free / 1e9:.1f} GB are free."
-        raise InputError(why, file=data.folder, field="--scale", hint=hint)
+        several = f" in {len(held)} processes" if len(held) > 1 else ""
+        why = f"needs {needed / 1e9:.1f} GB for its images{several}, and {free / 1e9:.1f} GB are free."
+        hint += "; or use fewer --processes" if several else ""
+        raise InputError(why, file=folder, field="--scale", hint=hint)
 
 
 def _free_memory() -> float | None:

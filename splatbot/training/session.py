@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from statistics import fmean
 from typing import Any
 
 import numpy as np
 
+from splatbot.atomic import sweep_drafts
 from splatbot.errors import InputError
 from splatbot.gaussians import GaussianModel
 from splatbot.training.datasets import TrainingData
 from splatbot.training.distributed import ALONE, TrainingGroup
 from splatbot.training.folder import ProgressRow, TrainingFolder, TrainingSettings
-from splatbot.training.images import ImageCache, check_memory
+from splatbot.training.images import ImageCache, check_memory, pixels
 from splatbot.training.initialize import initial_model
 from splatbot.training.options import TrainingOptions
 from splatbot.training.scoring import HeldOutScore, score_held_out, summary
@@ -94,12 +95,13 @@ class TrainingSession:
     ) -> None:
         self.folder = folder
         self.group = group
+        if resume and group.leads:
+            sweep_drafts(folder.path)
         train, held_out = data.split(settings.held_out_every)
         if settings.block is not None:
             train, held_out = tuple(view for view in train if view.name in settings.block.views), ()
-        check_memory(replace(data, views=train + held_out))
-        pixels = sum(view.camera.width * view.camera.height for view in train)
-        self.options: TrainingOptions = settings.options.capped(pixels)
+        check_memory(data.folder, *[train + held_out, *[train] * (group.local - 1)][: group.local])
+        self.options: TrainingOptions = settings.options.capped(pixels(train))
         self.images, self.held_out = ImageCache(train), ImageCache(held_out)
         saved = folder.load_checkpoint() if group.leads and resume and folder.checkpoint.exists() else None
         if saved is not None:

@@ -12,10 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 
 from splatbot.camera import Camera
 from splatbot.cli import main
-from splatbot.errors import InputError
+from splatbot.errors import FormatError, InputError
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import look_at
 from splatbot.training.blocks import Cut, SceneBlock, cut_scene, in_view, merged, start_of
@@ -70,17 +71,21 @@ def test_a_block_is_trained_by_the_views_that_show_it() -> None:
         cut_scene(points, views[:1], 2)
 
 
-def test_a_block_starts_with_its_margin_and_every_eighth_of_what_else_its_views_see() -> None:
-    rng = np.random.default_rng(0)
-    means = np.concatenate([rng.uniform(0.0, 2.0, (2000, 3)) * (1, 1, 0), [[50.0, 0.0, 0.0]] * 100])
+def model_at(means: NDArray[np.float64]) -> GaussianModel:
     n = len(means)
-    model = GaussianModel.from_activated(
+    return GaussianModel.from_activated(
         means=means,
         quats=np.tile([1.0, 0, 0, 0], (n, 1)),
         scales=np.full((n, 3), 0.01),
         opacities=np.full(n, 0.5),
         colors=np.full((n, 3), 0.5),
     )
+
+
+def test_a_block_starts_with_its_margin_and_every_eighth_of_what_else_its_views_see() -> None:
+    rng = np.random.default_rng(0)
+    means = np.concatenate([rng.uniform(0.0, 2.0, (2000, 3)) * (1, 1, 0), [[50.0, 0.0, 0.0]] * 100])
+    model = model_at(means)
     block = SceneBlock((Cut(0, 1.0, False),), 0.25, ("0",))
     views = [view_of("0", (1.0, 1.0, 2.0)), view_of("1", (50.0, 0.0, 0.0))]
     start = start_of(model, block, views, 0)
@@ -110,7 +115,7 @@ def test_the_merged_map_takes_each_gaussian_from_the_block_that_owns_its_place(t
         model.sh = torch.cat([model.sh, torch.randn(n, (degree + 1) ** 2 - 1, 3)], dim=1)
         model.save(tmp_path / f"{number}.ply")
         models.append(model)
-    whole = merged([(block, tmp_path / f"{number}.ply") for number, block in enumerate(blocks)])
+    whole = merged([(block, tmp_path / f"{number}.ply", None) for number, block in enumerate(blocks)])
     below, above = models[0].means[:, 1] < 0.25, models[1].means[:, 1] >= 0.25
     assert torch.equal(whole.means, torch.cat([models[0].means[below], models[1].means[above]]))
     assert torch.equal(
@@ -120,6 +125,58 @@ def test_the_merged_map_takes_each_gaussian_from_the_block_that_owns_its_place(t
     assert torch.equal(whole.sh[: int(below.sum()), :4], models[0].sh[below])
     assert not whole.sh[: int(below.sum()), 4:].any()
     assert torch.equal(whole.sh[int(below.sum()) :], models[1].sh[above])
+
+
+def test_a_gaussian_that_crosses_a_cut_keeps_its_owner_if_training_keeps_the_rows(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-1.0, 1.0, (300, 3))
+    model = model_at(points)
+    view = view_of("all", (0.0, 0.0, 2.0))
+    parts: list[tuple[SceneBlock, Path, Path | None]] = []
+    for number, block in enumerate(cut_scene(model.means.double().numpy(), [view], 4)):
+        start = start_of(model, block, [view], 0)
+        file, begun = tmp_path / f"{number}.ply", tmp_path / f"{number}.start.ply"
+        start.save(begun)
+        start.opacity_logits[:] = start.means[:, 0]  # names the row
+        start.means += 0.1 * torch.randn(start.means.shape, generator=torch.Generator().manual_seed(number))
+        start.save(file)
+        parts.append((block, file, begun))
+    whole = merged(parts)
+    assert torch.equal(whole.opacity_logits.sort().values, model.means[:, 0].sort().values)
+    assert len(merged([(block, file, None) for block, file, _ in parts])) != len(model)  # some did cross
+    with pytest.raises(FormatError, match="its start"):
+        merged([(parts[0][0], parts[1][1], parts[0][2])])
+
+
+@pytest.mark.parametrize("count", [2, 5])
+def test_points_that_share_a_coordinate_are_cut_at_the_next_one_or_across_another_axis(count: int) -> None:
+    rng = np.random.default_rng(0)
+    floor = np.concatenate([np.zeros(900), rng.uniform(0.0, 9.0, 100)])
+    points = np.stack([floor, rng.uniform(0.0, 1.0, 1000), np.full(1000, 0.5)], axis=1)
+    views = [view_of("0", (0.0, 0.5, 2.0)), view_of("1", (5.0, 0.5, 5.0))]
+    columns = np.repeat(points[:10], 100, axis=0)  # ten places
+    for scene in (points, columns):
+        blocks = cut_scene(scene, views, count)
+        held = np.array([block.holds(scene) for block in blocks])
+        assert (held.sum(axis=0) == 1).all()
+        assert (held.sum(axis=1) > 0).all()
+
+
+def test_points_in_one_place_cannot_be_cut() -> None:
+    with pytest.raises(InputError, match=r"--blocks: .*one place"):
+        cut_scene(np.ones((100, 3)), EVERYWHERE, 2)
+
+
+def test_a_view_that_shows_little_of_each_block_trains_the_one_it_shows_most() -> None:
+    edges = np.linspace(0.0, 16.0, 17)
+    points = np.stack(
+        [np.repeat(edges[:-1], 50) + np.tile(np.linspace(0.0, 0.99, 50), 16), *np.zeros((2, 800))], axis=1
+    )
+    above = view_of("above", (8.2, 0.0, 50.0))
+    views = [view_of(f"{i}", (float(x) + 0.5, 0.0, 0.0)) for i, x in enumerate(edges[:-1])]
+    blocks = cut_scene(points, [above, *views], 16)
+    assert np.count_nonzero(in_view(above, points)) == 800
+    assert [("above" in block.views) for block in blocks].count(True) == 1
 
 
 def test_the_settings_of_a_block_are_read_as_they_were_written(tmp_path: Path) -> None:
@@ -219,6 +276,6 @@ def test_blocks_lower_the_peak_memory_of_each_process(tmp_path: Path) -> None:
     for more in (["--out", str(tmp_path / "1")], ["--out", str(tmp_path / "4"), "--blocks", "4", "--processes", "2"]):
         command = [sys.executable, "-c", code, str(scene), *words, *more]
         peaks.append(int(subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout))
-    assert scores_of(tmp_path / "4")["gaussians"] == pytest.approx(1_000_000, rel=1e-3)
+    assert scores_of(tmp_path / "4")["gaussians"] == 1_000_000  # none lost, none doubled
     print(f"peak memory of a process: {peaks[0] / 2**20:.2f} GiB undivided, {peaks[1] / 2**20:.2f} GiB in 4 blocks")
     assert peaks[1] <= 0.6 * peaks[0]

@@ -15,6 +15,7 @@ from splatbot.camera import Camera
 from splatbot.errors import FormatError, InputError
 from splatbot.gaussians import GaussianModel
 from splatbot.training.datasets import TrainingData, TrainingView
+from splatbot.training.distributed import planned_group
 from splatbot.training.folder import TrainingFolder, TrainingSettings
 from splatbot.training.images import check_memory
 from splatbot.training.options import TrainingOptions
@@ -90,9 +91,47 @@ def test_images_beyond_the_free_memory_are_refused_with_a_scale_that_fits() -> N
 
     camera = Camera(1000.0, 1000.0, 0.0, 0.0, 60_000, 40_000)
     views = tuple(TrainingView(str(i), camera, np.eye(4), never) for i in range(1000))
-    huge = TrainingData("colmap", Path("huge"), views, np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
     with pytest.raises(InputError, match=r"needs 12800.0 GB .*--scale \d+"):
-        check_memory(huge)
+        check_memory(Path("huge"), views)
+
+
+def test_the_images_of_each_process_of_a_machine_count_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("splatbot.training.images._free_memory", lambda: 1e9)
+    camera = Camera(1000.0, 1000.0, 0.0, 0.0, 10_000, 10_000)
+    views = [TrainingView("0", camera, np.eye(4), lambda: np.zeros((1, 1, 3), np.uint8))]  # 4/3 of 0.4 GB
+    check_memory(Path("scene"), views)
+    with pytest.raises(InputError, match=r"needs 1.1 GB for its images in 2 processes.* fewer --processes"):
+        check_memory(Path("scene"), views, views)
+
+
+def test_two_local_processes_need_the_memory_of_two(data: TrainingData, monkeypatch: pytest.MonkeyPatch) -> None:
+    each = 4 / 3 * 4 * sum(view.camera.width * view.camera.height for view in data.views)
+    monkeypatch.setattr("splatbot.training.images._free_memory", lambda: 1.5 * each / 0.7)
+    settings = TrainingSettings(data.folder, 1, 0, TrainingOptions(iterations=1, batch=2))
+    TrainingSession(data, TrainingFolder("unused"), settings)
+    with pytest.raises(InputError, match="in 2 processes"):
+        TrainingSession(data, TrainingFolder("unused"), settings, group=planned_group(2))
+
+
+def test_a_new_training_removes_all_files_of_the_earlier_one_and_drafts_of_killed_ones(
+    data: TrainingData, tmp_path: Path
+) -> None:
+    session = session_of(tmp_path, data, every=0)
+    session.run()
+    session.score(lambda rows, scores: {"course.png": b"", "held_out.jpg": b""})
+    (tmp_path / "blocks" / "0").mkdir(parents=True)
+    (tmp_path / ".map.ply.0123.tmp").touch()
+    (tmp_path / ".0123.draft").mkdir()
+    (tmp_path / "notes.txt").touch()  # not its own
+    session_of(tmp_path, data, every=0)
+    assert {path.name for path in tmp_path.iterdir()} == {"training.json", "notes.txt"}
+
+
+def test_a_resumed_training_removes_drafts_of_killed_ones(data: TrainingData, tmp_path: Path) -> None:
+    session_of(tmp_path, data, every=0).run()
+    (tmp_path / ".map.ply.0123.tmp").touch()
+    session_of(tmp_path, data, every=0, resume=True)
+    assert not list(tmp_path.glob(".*"))
 
 
 def test_the_start_of_a_higher_degree_is_cut_and_one_of_a_lower_degree_is_used_from_the_first_step(
