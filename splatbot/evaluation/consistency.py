@@ -16,7 +16,10 @@ from splatbot.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
-_FITTED_FRAMES = 200  # of a long trajectory, by which the mount is fitted
+_FITTED_FRAMES = 100  # of a long trajectory, by which the mount is fitted
+_LEAST_FRAMES = 10  # for 12 unknowns
+_LONGEST_STEP = 0.1  # [s] between two samples of a reference that is interpolated
+_THREE_SIGMA = 20.06  # of ξᵀ C⁻¹ ξ, which 99.73 % of normally distributed errors with 6 dimensions do not exceed
 _MOUNT_SIGMA = np.repeat([0.05, np.radians(3.0)], 3)  # [m, rad] of the error of a reference's mount before the fit
 
 
@@ -38,6 +41,11 @@ class Consistency:
     values: Array
     T_reference_camera: Array = field(default_factory=lambda: np.eye(4))
 
+    @property
+    def within_three_sigma(self) -> float:
+        """Share of the frames with ξᵀ C⁻¹ ξ below its 99.73 % quantile; 0.9973 for Gaussian errors."""
+        return float(np.mean(6 * self.values < _THREE_SIGMA))
+
 
 def nees(
     reference: Trajectory,
@@ -50,13 +58,13 @@ def nees(
 ) -> Consistency:
     """Compare pose errors with their covariances by NEES / 6 = ξᵀ C⁻¹ ξ / 6.
 
-    The error ξ = log(T_estimated⁻¹ A T_true B) is a twist (translation [m], rotation [rad]) in the camera frame. A
-    reference that is sampled as densely as the estimate is interpolated at its stamps. The first common frame is left
-    out of the result, because it defines the world of the estimate.
+    The error ξ = log(T_estimated⁻¹ A T_true B) is a twist (translation [m], rotation [rad]) in the camera frame. The
+    reference is interpolated between samples of at most 0.1 s apart. Two kinds of frames are left out
+    of the result: the first common one, which A aligns, and those with a zero covariance, which define the world.
 
     Without ``fit_mount``, A aligns the first common frame and B is the identity. With it, A and B minimise Σ ξᵀ C⁻¹ ξ,
-    with a robust loss and a prior of B. Motion capture and arms follow a body that carries the camera. The calibration
-    of this mount is often wrong by a degree.
+    with a robust loss and a prior of B. As they take 12 of the 6 M dimensions, values are divided by 1 - 2 / M. Motion
+    capture and arms follow a body that carries the camera. The calibration of this mount is often wrong by a degree.
 
     Args:
         reference: true poses.
@@ -67,25 +75,30 @@ def nees(
         max_difference: largest difference [s] of the stamps of associated frames.
 
     Raises:
-        InputError: fewer than two frames can be associated, shapes differ, or a covariance is not positive definite.
+        InputError: fewer than two frames can be associated, or ten for ``fit_mount``; shapes differ, or a covariance is
+            not positive definite.
     """
     if covariances.shape != (len(estimate), 6, 6):
         raise InputError(
             f"have shape {covariances.shape} for {len(estimate)} poses.", field="covariances", hint="give (N, 6, 6)"
         )
-    of_reference, of_estimate = associate(reference, estimate, max_difference)
-    if len(of_reference) < 2:
+    common = np.unique(associate(reference, estimate, max_difference)[1])  # a dense reference has several of a frame
+    if len(common) < 2:
         raise InputError("only one frame can be associated.", field="stamps", hint="a normalised error needs two")
-    stamps, poses = estimate.stamps[of_estimate], estimate.T_world_camera[of_estimate]
-    truth = _at_stamps(reference, of_reference, stamps, max_difference)
+    truth = _at_stamps(reference, estimate.stamps[common])
+    A, B = estimate.T_world_camera[common[0]] @ inverse(truth[0]), np.eye(4)
+    uncertain = np.flatnonzero(covariances[common[1:]].any(axis=(1, 2))) + 1
+    truth, rows = truth[uncertain], common[uncertain]
+    if len(rows) < (_LEAST_FRAMES if fit_mount else 1):
+        hint = f"a fitted mount needs {_LEAST_FRAMES}" if fit_mount else "a normalised error needs one"
+        raise InputError(f"{len(rows)} frames with a covariance can be associated.", field="stamps", hint=hint)
     extra = np.zeros((6, 6)) if reference_covariance is None else reference_covariance
-    whitening = np.array([_whitening(C) for C in covariances[of_estimate][1:] + extra])
-    A, B = poses[0] @ inverse(truth[0]), np.eye(4)
+    poses, whitening = estimate.T_world_camera[rows], np.array([_whitening(C) for C in covariances[rows] + extra])
     if fit_mount:
-        A, B = _fitted(truth[1:], poses[1:], whitening, A)
-    errors = _normalized(truth[1:], poses[1:], whitening, A, B)
-    values = (errors**2).sum(axis=1) / 6
-    return Consistency(float(np.mean(values)), float(np.median(values)), stamps[1:], values, B)
+        A, B = _fitted(truth, poses, whitening, A)
+    values = (_normalized(truth, poses, whitening, A, B) ** 2).sum(axis=1) / 6
+    values /= 1 - 2 / len(rows) if fit_mount else 1
+    return Consistency(float(np.mean(values)), float(np.median(values)), estimate.stamps[rows], values, B)
 
 
 def _whitening(C: Array) -> Array:
@@ -110,20 +123,19 @@ def _fitted(truth: Array, poses: Array, whitening: Array, A: Array) -> tuple[Arr
         errors = _normalized(truth, poses, whitening, A @ se3_exp(x[:6]), se3_exp(x[6:]))
         return np.concatenate([errors.ravel(), x[6:] / _MOUNT_SIGMA])
 
-    x = least_squares(residuals, np.zeros(12), loss="soft_l1", f_scale=3.0, max_nfev=50).x
+    x = least_squares(residuals, np.zeros(12), loss="soft_l1", f_scale=3.0, max_nfev=25).x
     return A @ se3_exp(x[:6]), se3_exp(x[6:])
 
 
-def _at_stamps(reference: Trajectory, nearest: NDArray[np.intp], stamps: Array, max_difference: float) -> Array:
-    """Return the poses (M, 4, 4) of the reference at the stamps, or the nearest ones where its samples are sparse."""
-    poses = reference.T_world_camera[nearest].copy()
-    for i, stamp in enumerate(stamps):
-        after = int(np.searchsorted(reference.stamps, stamp))
-        if not 0 < after < len(reference):
-            continue
-        begin, end = reference.stamps[after - 1], reference.stamps[after]
-        if end - begin <= 2 * max_difference:
-            T_begin, T_end = reference.T_world_camera[after - 1], reference.T_world_camera[after]
-            step = se3_log(inverse(T_begin) @ T_end) * (stamp - begin) / (end - begin)
-            poses[i] = T_begin @ se3_exp(step)
-    return poses
+def _at_stamps(reference: Trajectory, stamps: Array) -> Array:
+    """Return the poses (M, 4, 4) of the reference at the stamps; at ends and in gaps, those of the nearest samples."""
+    poses = []
+    for stamp in stamps:
+        after = int(np.clip(np.searchsorted(reference.stamps, stamp), 1, max(len(reference) - 1, 1)))
+        rows = [after - 1, min(after, len(reference) - 1)]
+        (begin, end), (T_begin, T_end) = reference.stamps[rows], reference.T_world_camera[rows]
+        share = (stamp - begin) / (end - begin) if end > begin else 0.0
+        if not 0 <= share <= 1 or end - begin > _LONGEST_STEP:
+            share = float(share > 0.5)
+        poses.append(T_begin @ se3_exp(share * se3_log(inverse(T_begin) @ T_end)))
+    return np.array(poses)

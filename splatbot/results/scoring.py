@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,7 +37,7 @@ class TrajectoryScore:
     Args:
         absolute: ATE, with the M associated frames.
         relative: RPE; None with fewer than two of them.
-        consistency: NEES with the camera's fitted pose on the body of the reference; None with fewer than two of them,
+        consistency: NEES with the camera's fitted pose on the body of the reference; None with fewer than ten of them,
             or where covariances are not known.
         consistency_as_given: NEES with the reference as it is.
         estimate: (M, 3) [m] their camera centres, aligned to the reference.
@@ -81,15 +80,26 @@ def score_trajectory(
     associated = np.isin(estimate.stamps, absolute.stamps)
     during = (reference.stamps >= estimate.stamps[0] - 0.1) & (reference.stamps <= estimate.stamps[-1] + 0.1)
     several = len(absolute.errors) > 1
-    normalized = partial(nees, reference, estimate, covariances) if several and covariances is not None else None
     return TrajectoryScore(
         absolute=absolute,
         relative=relative_error(reference, estimate) if several else None,
-        consistency=normalized(fit_mount=True) if normalized else None,
-        consistency_as_given=normalized() if normalized else None,
+        consistency=_consistency(reference, estimate, covariances, fit_mount=True),
+        consistency_as_given=_consistency(reference, estimate, covariances, fit_mount=False),
         estimate=transform_points(absolute.T_reference_estimate, estimate.positions[associated]),
         reference=reference.positions[during],
     )
+
+
+def _consistency(
+    reference: Trajectory, estimate: Trajectory, covariances: NDArray[np.float64] | None, *, fit_mount: bool
+) -> Consistency | None:
+    """Return the NEES; None where it is not defined, with too few frames or without usable covariances."""
+    if covariances is None:
+        return None
+    try:
+        return nees(reference, estimate, covariances, fit_mount=fit_mount)
+    except InputError:
+        return None
 
 
 def trajectory_metrics(score: TrajectoryScore | None) -> dict[str, float | None]:
@@ -107,6 +117,7 @@ def trajectory_metrics(score: TrajectoryScore | None) -> dict[str, float | None]
         "ate_frames": len(score.absolute.errors) if score else 0,
         "rpe_trans_rmse_m": relative.trans_rmse if relative else None,
         "nees": fitted.mean if fitted else None,
+        "nees_within_3_sigma": fitted.within_three_sigma if fitted else None,
         "nees_as_given": given.mean if given else None,
         "reference_mount_m": float(np.linalg.norm(mount[:3])) if mount is not None else None,
         "reference_mount_deg": float(np.rad2deg(np.linalg.norm(mount[3:]))) if mount is not None else None,

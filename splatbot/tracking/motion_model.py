@@ -72,6 +72,11 @@ class ConstantVelocity:
         """Return the expected T_world_camera (4, 4) at a time [s]."""
         return self.T_world_camera @ se3_exp(self._motion(stamp))
 
+    @property
+    def velocity(self) -> Array:
+        """Mean twist (6,) [m/s, rad/s] between the last two poses, in the camera's frame; zero where it is unknown."""
+        return self._twist / self._interval if self._interval > 0 else np.zeros(6)
+
     def extrapolate(self, stamp: float) -> Array | None:
         """Return T_world_camera (4, 4) at a time [s], or None where the motion does not determine it.
 

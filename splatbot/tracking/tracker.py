@@ -35,7 +35,7 @@ Array = NDArray[np.float64]
 _MIN_GRAY_STD = 0.005
 
 _BEFORE_START = 0.03  # [s] from the pose by which a first frame in motion has its velocity, to this frame
-_WORSE = 1.1  # times the residual of the last alignment: a rectification by a wrong velocity
+_WORSE = 1.1  # times the lowest residual of the frame: a rectification by a wrong velocity
 _MAX_RECTIFICATIONS = 6  # by the velocity that the pose implies; each halves the error of the velocity at least
 
 
@@ -91,7 +91,7 @@ class Tracker:
         pose = self._confirm_relocalization(frame.stamp, pose)
         pose, uncertainty = self._filter_motion(pose, uncertainty, best, problem.prepared, trusted_prior)
         self._update(frame.stamp, pose, robot_prior)
-        return PoseEstimate.create(pose, uncertainty, problem, scheduler.budget, self._filter.twist_at(frame.stamp))
+        return PoseEstimate.create(pose, uncertainty, problem, scheduler.budget, self.motion.velocity)
 
     @property
     def is_lost(self) -> bool:
@@ -170,7 +170,7 @@ class Tracker:
         """Reject a robot prior that contradicts the frame, and search again from the motion prior without it."""
         if robot_prior is None:
             return best, None
-        view = problem.calibrated_view(self.expected_twist(problem.prepared.frame.stamp))
+        view = problem.calibrated_view(self.motion.velocity)
         covariance = self._uncertainty(best).covariance(view) if robot_prior.absolute else best.covariance
         distance = mahalanobis_distance(best, robot_prior, covariance) if best.verdict != "lost" else np.inf
         if is_consistent(distance):
@@ -189,6 +189,7 @@ class Tracker:
         """Align the frame again, rectified by the velocity that its pose implies, until its rows stay in place."""
         sensor = self.config.sensor
         predicted = self._predicted(problem.prepared.frame.stamp, best)
+        lowest = best.health.score
         for _ in range(_MAX_RECTIFICATIONS):
             prepared = problem.prepared
             twist = self._measured(predicted, best, prepared).twist
@@ -197,10 +198,11 @@ class Tracker:
             again = scheduler.align_again(prepare(prepared.recorded, self.config, twist), best)
             if again is best:  # no time is left
                 break
-            if again.health.score > _WORSE * best.health.score:  # the velocity is wrong
+            loses = again.verdict == "lost" and best.verdict != "lost"
+            if loses or again.health.score > _WORSE * lowest:  # the velocity is wrong
                 problem.replace_images(prepared, best.T_world_camera)
                 break
-            best = again
+            best, lowest = again, min(lowest, again.health.score)
         return best
 
     def _fuse_prior(
@@ -232,8 +234,15 @@ class Tracker:
         """
         if pose.verdict == "lost":
             return pose, uncertainty
+        stamp = prepared.frame.stamp
+        if (
+            pose.weak is not None and self._filter.predict(stamp) is None
+        ):  # the pose is filled, and has no better motion
+            covariance = self.variance_scale * pose.covariance
+            self._filter.update(CameraMotion.at_pose(stamp, pose.T_world_camera, covariance))
+            return pose, uncertainty
         measured = pose if robot_prior is not None else best
-        state = self._measured(self._predicted(prepared.frame.stamp, measured), measured, prepared)
+        state = self._measured(self._predicted(stamp, measured), measured, prepared)
         self._filter.update(state)
         if robot_prior is not None:
             return pose, uncertainty

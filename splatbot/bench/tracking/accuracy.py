@@ -31,10 +31,11 @@ from splatbot.bench.tracking.peers import Odometry, tracking_peers
 from splatbot.bench.tracking.stress import run_stress
 from splatbot.calibration.timing import with_estimated_timing
 from splatbot.config import Config, load_config, with_sensor
-from splatbot.evaluation import absolute_error, nees, relative_error
+from splatbot.evaluation import absolute_error, relative_error
 from splatbot.frame import Frame
 from splatbot.logs import Log, open_log
 from splatbot.protocols import Array
+from splatbot.results.scoring import score_trajectory
 from splatbot.slam import Slam
 from splatbot.trajectory import Trajectory
 
@@ -178,8 +179,10 @@ def add_rows(results: Results, log: Log, contender: Contender, outcome: Tracking
         add(RPE, 1e3 * relative.trans_rmse, "mm")
         add(RPE_ROT, float(np.degrees(relative.rot_rmse)), "°")
         if outcome.covariances is not None:
-            add(NEES, nees(truth, tracked, outcome.covariances, fit_mount=True).mean, "")
-            add(NEES_AS_GIVEN, nees(truth, tracked, outcome.covariances).mean, "")
+            score = score_trajectory(tracked, truth, outcome.covariances)
+            fitted, given = (score.consistency, score.consistency_as_given) if score else (None, None)
+            add(NEES, fitted.mean if fitted else None, "", None if fitted else "fewer than ten frames")
+            add(NEES_AS_GIVEN, given.mean if given else None, "")
         if outcome.covariances is not None and outcome.accepted is not None:
             add(JUMPS, 100.0 * jumps_reported_ok(truth, tracked, outcome.covariances, outcome.accepted), "%")
     add(TRACKED, 100.0 * len(tracked) / outcome.frames, "%")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from splatbot.bench.results import Results, Row
-from splatbot.bench.tracking import ATE, BENCHMARK, LOST, NEES, RESIDENT, RPE, TRACKED, TrackingSettings
+from splatbot.bench.tracking import ATE, BENCHMARK, LOST, NEES, NEES_AS_GIVEN, RESIDENT, RPE, TRACKED, TrackingSettings
 from splatbot.bench.tracking.accuracy import run_log
 from splatbot.bench.tracking.peers import TrackingPeer, tracking_peers
 from splatbot.bench.tracking.plots import plot_tracking
@@ -67,7 +67,9 @@ def test_every_contender_has_error_share_times_and_memory(run: tuple[Results, Pa
 
 def test_only_a_tracker_that_says_how_sure_it_is_has_a_nees(run: tuple[Results, Path]) -> None:
     results, _ = run
-    (found,) = [row for row in results.rows if row.metric == NEES]
+    (fitted,) = [row for row in results.rows if row.metric == NEES]
+    assert (fitted.peer, fitted.value, fitted.note) == (None, None, "fewer than ten frames")
+    (found,) = [row for row in results.rows if row.metric == NEES_AS_GIVEN]
     assert found.peer is None
     assert found.value is not None
     assert 0.05 < found.value < 3.0  # eight frames of 320x240 px share the errors of a keyframe or two

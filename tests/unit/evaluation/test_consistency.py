@@ -80,6 +80,28 @@ def test_a_reference_at_other_times_is_interpolated() -> None:
     assert nees(reference, estimate, covariances).values.max() < 1e-6
 
 
+def test_a_reference_with_many_samples_for_a_frame_counts_each_frame_once() -> None:
+    """The reference covers a tenth of the time, so that it has fewer poses than the estimate has frames, or more."""
+    _, estimate, covariances = trajectories(100, 6)
+    covariances[0] = 0  # of the frame that defines the world
+    stamps = np.arange(0, 0.333, 0.005)
+    poses = np.array([se3_exp(30 * t * np.array([0.01, 0.002, -0.005, 0.01, 0, 0.02])) for t in stamps])
+    found = nees(Trajectory(stamps, poses), estimate, covariances)
+    assert len(found.stamps) == len(set(found.stamps)) == 10
+    assert 0.2 < found.mean < 3
+
+
+def test_a_mount_is_not_fitted_to_a_few_frames() -> None:
+    reference, estimate, covariances = trajectories(10, 7)
+    assert np.isfinite(nees(reference, estimate, covariances).mean)
+    with pytest.raises(InputError, match="a fitted mount needs 10"):
+        nees(reference, estimate, covariances, fit_mount=True)
+
+
+def test_the_share_within_three_sigma_is_that_of_a_normal_distribution() -> None:
+    assert nees(*trajectories(4000, 8)).within_three_sigma == pytest.approx(0.9973, abs=2e-3)
+
+
 def test_covariances_that_cannot_be_are_refused() -> None:
     reference, estimate, covariances = trajectories(5, 3)
     with pytest.raises(InputError, match=r"have shape \(4, 6, 6\) for 5 poses"):

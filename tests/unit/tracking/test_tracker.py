@@ -17,6 +17,7 @@ from splatbot.tracking.features import Features
 from splatbot.tracking.health import Health
 from splatbot.tracking.hypothesis import Hypothesis, ScoredHypothesis
 from splatbot.tracking.motion_filter import CameraMotion
+from splatbot.tracking.motion_model import Prediction
 from splatbot.tracking.prepare import PreparedFrame, prepare
 from splatbot.tracking.reference import Reference, make_reference
 from splatbot.tracking.tracker import PoseEstimate, Tracker, order_by_distance, pose_distance
@@ -211,3 +212,19 @@ def test_an_unconstrained_direction_is_as_uncertain_as_it_errs() -> None:
         sigmas.append(pose.covariance[0, 0] ** 0.5)
     ratio = np.sqrt(np.mean(np.square(errors))) / np.mean(sigmas)
     assert 0.5 < ratio < 1.5
+
+
+@pytest.mark.parametrize("gap", [0.1, 0.2])
+def test_an_unconstrained_direction_stays_that_of_the_prediction_after_a_gap(gap: float) -> None:
+    """Over 0.2 s the velocity is unknown. The alignment is half a metre off along a corridor, which it cannot see."""
+    information = np.diag([0.0, 1e7, 1e7, 1e7, 1e7, 1e7])
+    weak = weak_directions(information, 1.0, TrackingConfig().min_eigen_ratio)
+    tracker = Tracker(TrackingConfig())
+    tracker._filter.update(CameraMotion.at_pose(0.0, np.eye(4), 1e-6 * np.eye(6), np.zeros(6)))
+    alignment = Alignment(se3_exp([0.5, 0, 0, 0, 0, 0]), information, information, information, 48, 500.0)
+    health, hypothesis = Health(1.0, 1.0, 1.0, 1.0, 1.0, 1.0), Hypothesis("direct", alignment, [])
+    best = ScoredHypothesis(hypothesis, health, "degraded", (), weak, alignment_covariance(alignment))
+    filled = tracker._fuse_prior(best, None, Prediction(np.eye(4), 1e-4 * np.eye(6)))
+    prepared = SimpleNamespace(frame=SimpleNamespace(stamp=gap), twist=np.zeros(6))
+    pose, _ = tracker._filter_motion(*filled, best, prepared, None)  # type: ignore[arg-type]
+    assert abs(pose.T_world_camera[0, 3]) < 1e-3
