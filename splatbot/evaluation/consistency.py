@@ -60,7 +60,7 @@ def nees(
 
     The error ξ = log(T_estimated⁻¹ A T_true B) is a twist (translation [m], rotation [rad]) in the camera frame. The
     reference is interpolated between samples of at most 0.1 s apart. Two kinds of frames are left out
-    of the result: the first common one, which A aligns, and those with a zero covariance, which define the world.
+    of the result. A aligns the first common one, and those with a zero covariance define the world.
 
     Without ``fit_mount``, A aligns the first common frame and B is the identity. With it, A and B minimise Σ ξᵀ C⁻¹ ξ,
     with a robust loss and a prior of B. As they take 12 of the 6 M dimensions, values are divided by 1 - 2 / M. Motion
