@@ -15,6 +15,7 @@ from splatbot.errors import DeviceError, InputError
 from splatbot.frame import Frame
 from splatbot.layouts import REPLAY as PREFIX
 from splatbot.logs import Log, open_log
+from splatbot.logs.calibration import Calibration
 
 _QUEUE = 4  # frames that a driver buffers for a slow reader, the default of depthai's queues
 _END = object()
@@ -117,6 +118,11 @@ class ReplayCamera:
         own = "&".join(pair for pair in pairs if pair.partition("=")[0] not in kinds)
         recording = open_log(log + (f"?{own}" if own else ""), joint_delay=joint_delay)
         return cls(recording, ReplayOptions(**values))
+
+    @property
+    def calibration(self) -> Calibration:
+        """Calibration of the log, with its values of the sensor."""
+        return self._log.calibration
 
     def close(self) -> None:
         """End the stream; a waiting reader receives no further frame."""

@@ -191,16 +191,23 @@ def _add_tiles(runtime: Runtime, folder: Path) -> None:
 
 
 def _follow_camera(runtime: Runtime, device: str) -> None:
-    """Map a camera, opened with the delay of its joints; the scene is that of the settings or of the replayed log."""
-    from splatbot.robots.cameras import open_camera
+    """Map a camera, opened with the delay of its joints.
+
+    The scene is that of the settings or of the replayed log, whose camera file gives the sensor as well.
+    """
+    from splatbot.config import with_sensor
+    from splatbot.robots.cameras import ReplayCamera, open_camera
     from splatbot.services.mapping import workspace_of
     from splatbot.slam import Slam
 
     workspace = runtime.workspace or workspace_of(device.removeprefix(REPLAY), None)
     mask = runtime.new_mask(workspace)
     source = open_camera(device, joint_delay=0.0 if mask is None else mask.joint_delay)
+    config = runtime.config
+    if isinstance(source, ReplayCamera):
+        config = with_sensor(config, source.calibration.sensor, file=source.calibration.file)
     served = runtime.store.add(MAP_ID, source=source.name, state="mapping", workspace=workspace, mask=mask)
-    runtime.follow(served, source, Slam(runtime.config))
+    runtime.follow(served, source, Slam(config))
 
 
 def _follow_log(runtime: Runtime, log: str, camera: str | None) -> None:

@@ -6,10 +6,14 @@ import json
 from pathlib import Path
 from typing import Any
 
+import pytest
+
+from splatbot.cli.serve import _follow_camera
 from splatbot.config import Config, SensorConfig
 from splatbot.logs import open_log
 from splatbot.logs.record import record
 from splatbot.services.mapping import config_of
+from splatbot.services.runtime import Runtime
 from splatbot.services.settings import ServiceSettings
 from tests.contracts.conftest import running
 
@@ -25,6 +29,19 @@ def test_the_camera_file_of_a_log_sets_the_sensor_unless_the_configuration_does(
     log = open_log(str(log_with_sensor(tmp_path / "desk", {"readout": 0.03, "min_depth": 0.1})))
     sensor = config_of(log, Config(sensor=SensorConfig(min_depth=0.3))).tracking.sensor
     assert (sensor.readout, sensor.min_depth) == (0.03, 0.3)
+
+
+def test_a_replayed_log_is_mapped_with_the_sensor_of_its_camera_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = log_with_sensor(tmp_path / "desk", {"readout": 0.03})
+    runtime, sensors = Runtime(ServiceSettings(port=0)), []
+    monkeypatch.setattr(runtime, "follow", lambda served, source, mapper: sensors.append(mapper.config.tracking.sensor))
+    try:
+        _follow_camera(runtime, f"replay:{log}?speed=2")
+    finally:
+        runtime.close()
+    assert [sensor.readout for sensor in sensors] == [0.03]
 
 
 def test_a_camera_file_with_a_wrong_setting_makes_no_map(tmp_path: Path) -> None:
