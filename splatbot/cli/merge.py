@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from splatbot.cli.messages import print_message
 from splatbot.cli.paths import check_output, check_state
 from splatbot.errors import FormatError
-from splatbot.results.merge_output import check_merge, draft_of
+from splatbot.results.merge_output import check_merge, draft_of, restore_run
 
 if TYPE_CHECKING:
     from splatbot.mapping.alignment import MapAlignment
@@ -33,7 +34,8 @@ def merge(
     Several keyframes of B must agree on the pose of B in A; otherwise nothing is written. Surface of both is fused. A
     loses the surface that the depth of B sees through, and B adds the surface that A lacks. DIR is a run folder like
     any other; its log plays both recordings (recordings.yaml). merge.json has the figures of the merge. DIR is not
-    touched before the merged run is whole: Ctrl-C until then leaves it as it was.
+    touched before the merged run is whole. Ctrl-C during the refinement saves the run up to there, but does not replace
+    another run.
 
     Examples:
         splatbot merge runs/monday runs/tuesday --out runs/both
@@ -43,12 +45,13 @@ def merge(
         a: a folder that `splatbot map` wrote, with its saved state.
         b: the later one.
         out: folder to write.
-        overwrite: replace the run that --out holds. Other files, as its scene.yaml, stay.
+        overwrite: replace the run that --out holds, once the merged one is whole. Other files, as scene.yaml, stay.
         no_report: write no audit, report.html and map.html, which take seconds.
         as_json: print merge.json.
         quiet: no progress and no summary.
     """
     check_runs(a, b)
+    restore_run(out)
     check_merge(a, b, out, overwrite=overwrite)
     check_output(out, folder=True)
     check_output(draft_of(out), folder=True)
@@ -68,7 +71,9 @@ def merge(
             report=not no_report,
             overwrite=overwrite,
         )
-    if as_json:
+    if not found.saved:
+        print_message("warning", f"the merge ended early, and {out} keeps its earlier run.")
+    elif as_json:
         print(json.dumps(found.summary(), indent=2, allow_nan=False))
     elif not quiet:
         _print(out, found)

@@ -26,7 +26,15 @@ from splatbot.mapping.keyframes import Keyframe
 from splatbot.mapping.rigid_motion import move_gaussians, move_keyframe
 from splatbot.protocols import Array
 from splatbot.results.folder import RunFolder
-from splatbot.results.merge_output import RECORDINGS, SUMMARY, check_merge, draft_of, replace_run
+from splatbot.results.merge_output import (
+    RECORDINGS,
+    SUMMARY,
+    check_merge,
+    draft_of,
+    earlier_run,
+    replace_run,
+    restore_run,
+)
 from splatbot.run.interrupts import Interrupts
 from splatbot.run.job import RunResult, map_log
 from splatbot.run.outcome import MapPage
@@ -47,12 +55,14 @@ class MergedRun:
         alignment: pose of B in A.
         joined: the common Gaussians, before the last refinement.
         time_offset: time [s] that is added to the stamps of B.
+        saved: whether the folder has the merged run. One that ended early does not replace another run.
     """
 
     run: RunResult
     alignment: MapAlignment
     joined: JoinedModel
     time_offset: float
+    saved: bool = True
 
     def summary(self) -> dict[str, Any]:
         """Return the figures of the merge under the stable keys of ``merge.json``."""
@@ -166,7 +176,8 @@ def merge_runs(
     Args:
         aligned: the runs. Gaussians and keyframes of B are moved; the runs on disk stay as they are.
         out: folder to write. It stays as it is until the merged run is whole, which then replaces it. An error or
-            Ctrl-C before that removes the unfinished run.
+            Ctrl-C before the refinement removes the unfinished run. A run that ends early during the refinement is
+            saved if ``out`` holds no other one.
         on_progress: called at every phase.
         map_page: makes a page of the finished map for the report. If None, the report has no such page.
         report: audit the merged map and write the report.
@@ -176,11 +187,14 @@ def merge_runs(
         LogError: the recording of a run is missing.
         InputError: A and B are one run, ``out`` is one of them or holds a run, or it cannot be written.
     """
+    restore_run(out)
     check_merge(aligned.a.folder, aligned.b.folder, out, overwrite=overwrite)
     draft = draft_of(out)
     try:
         shutil.rmtree(draft, ignore_errors=True)
         found = _merge_into(RunFolder.create(draft), Path(out), aligned, on_progress, map_page, report=report)
+        if found.run.exit_code != 0 and earlier_run(out):
+            return replace(found, saved=False)
         with Interrupts():
             replace_run(draft, out)
         return found

@@ -174,6 +174,19 @@ def test_ctrl_c_at_a_terminal_while_the_merged_map_is_refined_keeps_both_runs_an
     assert run("info", "c").code == 0
 
 
+def test_ctrl_c_at_a_terminal_while_the_merged_map_is_refined_keeps_the_run_that_it_would_replace(
+    runs: tuple[str, str], work_folder: Path
+) -> None:
+    shutil.copytree(runs[0], "c")
+    before = _files("c")
+    words = ("merge", *runs, "--out", "c", "--no-report", "--overwrite")
+    shown = at_a_terminal(*words, columns=80, interrupt_at="refining", cwd=work_folder)
+    assert shown.code == 130, shown.text
+    assert "c keeps its earlier run" in shown.text
+    assert _files("c") == before
+    assert [path.name for path in Path().iterdir()] == ["c"]
+
+
 def test_the_json_of_aligned_runs_has_the_identity_and_the_picture(
     run: RunCommand, runs: tuple[str, str], work_folder: Path
 ) -> None:
