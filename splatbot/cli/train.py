@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 _DEFAULT_ITERATIONS = 7_000
 _WIDE_COLUMNS = 110  # of a terminal that shows all numbers
 _OF_A_RUN = "training"  # folder of a training within its run
+_PATIENCE_S = 5.0  # of a second Ctrl-C with a step that other processes still compute
 
 
 def train(
@@ -170,17 +171,25 @@ def _train(
     from splatbot.training.distributed import connected
     from splatbot.training.session import TrainingSession
 
-    in_place = _is_in_place(data, folder, settings)
+    in_place, begun = _is_in_place(data, folder, settings), resumed
+    signals: list[None] = []
+
+    def watch(waited_s: float) -> None:
+        if len(signals) > 1 and waited_s > _PATIENCE_S:
+            raise KeyboardInterrupt
+
     with Interrupts() as interrupts, _progress(quiet) as report:
-        with ExitStack() as processes:
+        interrupts.when_requested = lambda: signals.append(None)
+        with _resumable(folder, lambda: begun), ExitStack() as processes:
             with interrupts.interruptible():
-                processes.enter_context(connected(group, settings, log))
+                group = processes.enter_context(connected(replace(group, watch=watch), settings, log))
                 start = _start(data, folder, settings) if group.leads else None
                 session = TrainingSession(
                     data, folder, settings, start=start, checkpoint_s=checkpoint_every, resume=resumed, group=group
                 )
                 if not resumed and group.leads:
                     folder.begin(settings)
+                    begun = True
             session.run(report=report, stop=lambda: interrupts.requested is not None)
         if not group.leads:
             return 0
@@ -193,6 +202,19 @@ def _train(
     if not quiet:
         _print(folder, data.folder / MAP_NAME if in_place else folder.map, scores)
     return 0 if scores["complete"] else _interrupted(folder, interrupts.requested)
+
+
+@contextmanager
+def _resumable(folder: TrainingFolder, begun: Callable[[], bool]) -> Iterator[None]:
+    """Name --resume as the fix of a lost process in the block, once this training has a checkpoint."""
+    from splatbot.training.helpers import LostProcessError
+
+    try:
+        yield
+    except LostProcessError as error:
+        if error.hint is None and begun() and folder.checkpoint.exists():
+            error.hint = f"`splatbot train --resume {folder.path}` continues from the last checkpoint"
+        raise
 
 
 def _train_blocks(

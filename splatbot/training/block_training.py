@@ -121,7 +121,7 @@ class BlockTraining:
 
         Raises:
             LostProcessError: the process of a block failed.
-            InputError: the images of the blocks that train at the same time do not fit into memory.
+            InputError: an input of a block cannot be used, or the images of blocks at a time do not fit into memory.
         """
         more = ["--quiet", "--checkpoint-every", str(checkpoint_s), *(() if log is None else ("--log", log))]
         waiting = [part for part in self._parts if not _is_complete(part)]
@@ -136,7 +136,9 @@ class BlockTraining:
                     for helper in running:
                         helper.process.wait()
                     return False
-                check_helpers(running)
+                check_helpers(
+                    running, f"`splatbot train --resume {self.folder.path}` continues with the unfinished blocks"
+                )
                 for helper in [helper for helper in running if helper.process.poll() == 0]:
                     running.remove(helper)
                     report(f"{helper.name} is trained")

@@ -1,8 +1,8 @@
 """Blocks of a scene along a kd-tree, each trained apart, as in VastGaussian (Lin et al. 2024).
 
 A block owns the Gaussians whose centres lie inside, at the start where training keeps all, else at the end. It trains
-them with those of a margin, and with every eighth of the others that its views see. Both explain the rest of its images,
-and are dropped at the merge.
+them with those of a margin, and with every eighth of the others that its views see. Both explain the rest of its
+images, and are dropped at the merge.
 """
 
 from __future__ import annotations

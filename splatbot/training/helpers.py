@@ -12,7 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from splatbot.batch.workers import usable_cores
-from splatbot.errors import SplatbotError
+from splatbot.errors import InputError, SplatbotError
+
+_ENDING_S = 5.0  # of a helper whose leash is gone; it saves nothing
 
 
 class LostProcessError(SplatbotError):
@@ -75,19 +77,30 @@ def started_helpers(at_once: int) -> Iterator[Start]:
     finally:
         os.close(hold)
         for helper in helpers:
-            helper.process.wait()
+            try:
+                helper.process.wait(_ENDING_S)
+            except subprocess.TimeoutExpired:  # as of a stopped one
+                helper.process.kill()
+                helper.process.wait()
         os.close(leash)
 
 
-def check_helpers(helpers: Sequence[Helper]) -> None:
-    """Check that no helper has failed.
+def check_helpers(helpers: Sequence[Helper], hint: str | None = None) -> None:
+    """Check that no helper has failed; a failure that others follow from has priority.
+
+    Args:
+        helpers: to check.
+        hint: fix of a helper that names none.
 
     Raises:
-        LostProcessError: one has; a failure that others follow from has priority.
+        InputError: an input of a helper cannot be used.
+        LostProcessError: a helper failed otherwise.
     """
     failed = sorted((helper for helper in helpers if helper.failure()), key=lambda helper: helper.process.poll() == 1)
     if failed:
-        raise LostProcessError(failed[0].failure(), hint="`splatbot train --resume` continues from the last checkpoint")
+        message, _, fix = failed[0].failure().partition(" Fix: ")
+        wrong_input = failed[0].process.poll() == InputError.exit_code
+        raise (InputError if wrong_input else LostProcessError)(message, hint=fix or hint)
 
 
 def threads_each(at_once: int) -> int:

@@ -14,7 +14,7 @@ from splatbot.atomic import sweep_drafts
 from splatbot.errors import InputError
 from splatbot.gaussians import GaussianModel
 from splatbot.training.datasets import TrainingData
-from splatbot.training.distributed import ALONE, TrainingGroup
+from splatbot.training.distributed import ALONE, TrainingGroup, check_same, numerics
 from splatbot.training.folder import ProgressRow, TrainingFolder, TrainingSettings
 from splatbot.training.images import ImageCache, check_memory, pixels
 from splatbot.training.initialize import initial_model
@@ -79,7 +79,8 @@ class TrainingSession:
     Raises:
         FormatError: the checkpoint is damaged.
         LostProcessError: another process of the group is gone.
-        InputError: the images do not fit into memory, or are not those of the checkpoint or of the first process.
+        InputError: the images do not fit into memory, or are not those of the checkpoint or of the first process. Its
+            options, software and vector instructions count too.
     """
 
     def __init__(
@@ -120,8 +121,9 @@ class TrainingSession:
         if saved is not None:
             self._restore(saved)
         if group.size > 1:
-            first = group.broadcast(self._state())
+            first = group.broadcast(self._state() | {"setup": self._setup()})
             self._check_views(first["views"], data)
+            check_same(self._setup(), first["setup"])
             self._restore(first)
 
     def _check_views(self, views: list[str], data: TrainingData) -> None:
@@ -139,6 +141,10 @@ class TrainingSession:
             "rows": [vars(row) for row in self.rows],
             "losses": self._losses,
         }
+
+    def _setup(self) -> dict[str, Any]:
+        """Return the values that must be the same in all processes of the group."""
+        return {**vars(self.options), "scene extent": self.trainer.extent, **numerics()}
 
     def _restore(self, state: dict[str, Any]) -> None:
         """Go back to a :meth:`_state`."""

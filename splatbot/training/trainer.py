@@ -155,6 +155,7 @@ class Trainer:
         return loss
 
     def _step(self, progress: float) -> float:
+        self.group.check_count(len(self.model))
         views = [(self._next_view(), self._background()) for _ in range(self.options.batch)]
         reduce = _reduction(progress, self.options.coarse_share)
         scheduled = int(progress / CONSTANTS.harmonics_share * (self.options.sh_degree + 1))

@@ -6,8 +6,14 @@ import json
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import replace
+from datetime import timedelta
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +23,12 @@ import pytest
 import torch
 
 from splatbot.cli import main
+from splatbot.errors import InputError
 from splatbot.gaussians import GaussianModel
 from splatbot.optimize.adam import PARAMETERS
 from splatbot.training.distributed import ALONE, TrainingGroup, connected, planned_group
 from splatbot.training.folder import TrainingFolder, TrainingSettings
-from splatbot.training.helpers import started_helpers
+from splatbot.training.helpers import LostProcessError, check_helpers, started_helpers
 from splatbot.training.images import ImageCache
 from splatbot.training.initialize import initial_model
 from splatbot.training.options import TrainingOptions
@@ -52,40 +59,62 @@ def trained(group: TrainingGroup = ALONE, **options: Any) -> Trainer:
     return trainer
 
 
-def second_process() -> None:
-    """Take part in the test below as process 1."""
+def second_process(report: str) -> None:
+    """Take part in the test below as process 1, and write digests of its results to a file."""
     group = planned_group(1)
     with connected(group, SETTINGS):
-        for options in OPTIONS:
-            trained(group, batch=2, **options)
-        session_of(Path(), group).run()
+        digests = [digest(trained(group, batch=2, **options)) for options in OPTIONS]
+        session = session_of(Path(), group)
+        session.run()
+        Path(report).write_text(json.dumps([*digests, digest(session.trainer)]))
+        with pytest.raises(LostProcessError, match="100 to 101 Gaussians"):
+            group.check_count(100 + group.rank)
+        with pytest.raises(InputError, match=r"seed: is 1 in this process, 0 in process 0\..*equal CPUs"):
+            session_of(Path(), group, seed=1)
 
 
-def session_of(folder: Path, group: TrainingGroup = ALONE) -> TrainingSession:
-    """Return a session of which each process has other random points, unless those of process 0 count."""
+def digest(trainer: Trainer) -> str:
+    """Return a digest of all parameters and poses."""
+    tensors = [getattr(trainer.model, name) for name in PARAMETERS]
+    return sha256(b"".join(tensor.numpy().tobytes() for tensor in (*tensors, trainer.poses.viewmats))).hexdigest()
+
+
+def session_of(folder: Path, group: TrainingGroup = ALONE, seed: int = 0) -> TrainingSession:
+    """Return a session with random points, which process 0 alone draws."""
     data = rendered_data(4)
-    options = TrainingOptions(iterations=4, max_gaussians=50, batch=2, seed=group.rank)
+    options = TrainingOptions(iterations=4, max_gaussians=50, batch=2, seed=seed)
     settings = TrainingSettings(data.folder, 1, 0, options)
     return TrainingSession(data, TrainingFolder(folder), settings, group=group)
 
 
 @pytest.fixture
-def two_processes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> TrainingGroup:
-    """Process 0 of two; the other runs :func:`second_process`."""
+def second(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[subprocess.Popen[bytes]]:
+    """Make this process number 0 of two; the other runs :func:`second_process`."""
     variables = {"WORLD_SIZE": "2", "MASTER_ADDR": f"file://{tmp_path}/store", "MASTER_PORT": "0"}
     for name, value in {**variables, "RANK": "0", "GLOO_SOCKET_IFNAME": "lo"}.items():
         monkeypatch.setenv(name, value)
-    code = "from tests.unit.training.test_distributed import second_process; second_process()"
-    subprocess.Popen([sys.executable, "-c", code], env={**os.environ, "RANK": "1"})
-    return planned_group(1)
+    code = "import sys; from tests.unit.training.test_distributed import second_process; second_process(sys.argv[1])"
+    process = subprocess.Popen([sys.executable, "-c", code, f"{tmp_path}/digests"], env={**os.environ, "RANK": "1"})
+    yield process
+    process.kill()
+    process.wait()
 
 
-def test_two_processes_take_the_steps_of_one_that_sees_both_views(two_processes: TrainingGroup, tmp_path: Path) -> None:
-    assert (two_processes.rank, two_processes.size) == (0, 2)
-    with connected(two_processes, SETTINGS):
-        found = [trained(two_processes, batch=2, **options) for options in OPTIONS]
-        session = session_of(tmp_path, two_processes)
+def test_two_processes_take_the_steps_of_one_that_sees_both_views(
+    second: subprocess.Popen[bytes], tmp_path: Path
+) -> None:
+    group = planned_group(1)
+    assert (group.rank, group.size, group.local) == (0, 2, 0)
+    with connected(group, SETTINGS):
+        found = [trained(group, batch=2, **options) for options in OPTIONS]
+        session = session_of(tmp_path, group)
         session.run()
+        with pytest.raises(LostProcessError, match="100 to 101 Gaussians"):
+            group.check_count(100 + group.rank)
+        session_of(tmp_path, group)  # the other refuses its own
+        assert second.wait(timeout=120) == 0
+    digests = json.loads((tmp_path / "digests").read_text())
+    assert digests == [digest(trainer) for trainer in (*found, session.trainer)]
     for options, two in zip(OPTIONS, found, strict=True):
         one = trained(batch=2, **options)
         assert len(one.model) == len(two.model)
@@ -167,6 +196,13 @@ def test_wrong_numbers_of_processes_are_named_with_a_fix(
     assert not (tmp_path / "out").exists()
 
 
+@pytest.fixture
+def free_port() -> int:
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        return int(listener.getsockname()[1])
+
+
 def start(*words: str, **variables: str) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "splatbot", "train", *words, "--quiet"]
     return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env={**os.environ, **variables})
@@ -229,9 +265,91 @@ def test_the_failure_of_a_helper_is_its_error_or_its_signal(tmp_path: Path) -> N
         assert killed.failure() == "process 2 of 2 was ended by SIGKILL."
         assert wrong.process.wait() == 2
         assert re.match(r"process 1 of 2: DATASET: .* Fix: ", wrong.failure())
+        with pytest.raises(InputError, match=r"process 1 of 2: DATASET: .* Fix: name a folder") as caught:
+            check_helpers([wrong, killed])
+        assert str(caught.value).count("Fix:") == 1
+        with pytest.raises(LostProcessError, match=r"SIGKILL\. Fix: again"):
+            check_helpers([killed], "again")
         unfinished = start_helper("process 3", ["help"], tmp_path / "3.log", {})
         assert unfinished.failure() == ""
     assert unfinished.process.poll() is not None
+
+
+def test_the_wrong_input_of_a_helper_is_that_of_the_command() -> None:
+    settings = replace(SETTINGS, dataset=Path("/nowhere"))
+    with (
+        pytest.raises(InputError, match=r"process 1 of 2: /nowhere: ") as caught,
+        connected(planned_group(2), settings),
+    ):
+        pass
+    assert "--resume" not in str(caught.value)
+
+
+def test_a_process_that_nobody_meets_ends_with_the_time_that_it_waited(
+    free_port: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("splatbot.training.distributed._CONNECTION", timedelta(seconds=1))
+    for name, value in {"RANK": "1", "WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": free_port}.items():
+        monkeypatch.setenv(name, str(value))
+    group, message = planned_group(1), "another process does not answer"
+    with pytest.raises(LostProcessError, match=message) as caught, connected(group, SETTINGS):
+        pass
+    assert caught.value.hint is None  # there is nothing to resume
+
+
+def test_a_process_that_ends_between_meeting_and_connection_is_noticed(tmp_path: Path) -> None:
+    code = f"""
+import torch.distributed as dist
+from splatbot.training.distributed import TrainingGroup, connected
+from splatbot.training.helpers import LostProcessError
+from tests.unit.training.test_distributed import SETTINGS
+
+store = dist.FileStore({str(tmp_path / "store")!r}, 2)
+store.set("splatbot/1", "")
+
+def watch(waited_s):
+    if waited_s > 0.5:
+        raise LostProcessError("process 1 of 2 was ended.")
+
+try:
+    with connected(TrainingGroup(0, 2, watch=watch), SETTINGS):
+        pass
+except LostProcessError as error:
+    print(error)
+"""
+    variables = {"WORLD_SIZE": "2", "RANK": "0", "MASTER_ADDR": f"file://{tmp_path}/store", "MASTER_PORT": "0"}
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, env={**os.environ, **variables}, stdout=subprocess.PIPE, text=True, timeout=120)
+    assert (done.returncode, done.stdout) == (0, "process 1 of 2 was ended.\n")
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("starter", ["--processes", "torchrun"])
+def test_a_second_ctrl_c_ends_the_command_while_another_process_hangs(
+    starter: str, scene: Path, tmp_path: Path, free_port: int
+) -> None:
+    out = tmp_path / "out"
+    words = (str(scene), "--iterations", "1000000", "--max-gaussians", "500", "--checkpoint-every", "0.2")
+    if starter == "torchrun":
+        shared = {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free_port)}
+        process = start(*words, "--out", str(out), **shared, RANK="0")
+        other = start(*words, "--out", str(tmp_path / "other"), **shared, RANK="1")
+    else:
+        process = start(*words, "--out", str(out), "--processes", "2")
+    until((out / "checkpoint.pt").is_file)
+    hung = other.pid if starter == "torchrun" else helper_of(process)
+    try:
+        os.kill(hung, signal.SIGSTOP)
+        process.send_signal(signal.SIGINT)
+        with pytest.raises(subprocess.TimeoutExpired):  # the first one waits for the step
+            process.wait(timeout=1)
+        process.send_signal(signal.SIGINT)
+        code, err = finish(process)
+        assert (code, err) == (130, "interrupted\n")
+    finally:
+        with suppress(ProcessLookupError):
+            os.kill(hung, signal.SIGKILL)
+        process.kill()
 
 
 @pytest.mark.long
