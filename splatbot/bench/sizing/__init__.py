@@ -11,7 +11,8 @@ from typing import Annotated, Any, ClassVar
 from tyro.conf import Suppress, arg
 
 from splatbot.bench.benchmark import Benchmark, ReportProgress, Settings
-from splatbot.bench.results import Results, Row
+from splatbot.bench.results import Results
+from splatbot.bench.sizing.costs import is_measured
 from splatbot.bench.tables import Table, cases, per_metric
 from splatbot.errors import InputError
 
@@ -46,7 +47,7 @@ class SizingSettings(Settings):
         balancer: Network link of a balancer, in each direction.
         load: Share of each resource that the plan uses.
         shard: Gaussians of one shard of the map, at most 50 million.
-        costs: Measured costs of an earlier run (sizing.json). If not given, they are measured.
+        costs: Measured costs of an earlier run (sizing.json), with their machine. If not given, they are measured.
         log: Log whose frames are pushed.
         measured: Gaussians of the served tiled map.
         requests: Number of timed requests of a kind.
@@ -124,15 +125,11 @@ def _plot(results: Results, folder: Path) -> None:
     plot_utilisation(results, folder)
 
 
-def _is_cost(row: Row) -> bool:
-    return not row.case.startswith(("plan:", "simulated "))
-
-
 BENCHMARK = Benchmark(
     SizingSettings,
     _measure,
     tables=(
-        Table("Measured costs", _is_cost),
+        Table("Measured costs", is_measured),
         Table("Plan of the fleet", cases("plan: fleet"), layout=per_metric),
         Table("Plan by resource; the first one saturates first", cases("plan: resource"), split_by=None),
         Table("Simulated requests of a node, and of single processes on one core", cases("simulated")),

@@ -13,9 +13,10 @@ from splatbot.errors import FormatError
 FRAME, COLLISIONS, DISTANCE, PLAN = KINDS = ("frame", "collisions", "distance", "plan")
 PLACE = "new place"
 _CPU, _IN, _OUT = "CPU", "request", "answer"
+_MACHINE = ("cpu", "cpus", "load_1min", "isa", "fma_peak_gflops")
 _SINGLE = {
-    "place_memory": (PLACE, "memory", "MB", 1e6),
-    "place_read": (PLACE, "read", "MB", 1e6),
+    "place_tiles": (PLACE, "tiles", "MB", 1e6),
+    "place_fields": (PLACE, "fields", "MB", 1e6),
     "disk_each": ("Gaussian", "disk", "byte", 1.0),
     "shared_process": ("process of the shared map", "memory", "MB", 1e6),
     "live_process": ("process of live maps", "memory", "MB", 1e6),
@@ -43,8 +44,8 @@ class Costs:
 
     Args:
         requests: by kind: ``KINDS``, and ``PLACE``, the first query at a place of the shared map.
-        place_memory: tiles and field of a place in memory [bytes].
-        place_read: tiles of a place [bytes].
+        place_tiles: tiles of a place, which are read from disk and stay in memory [bytes].
+        place_fields: collision fields of a place in memory [bytes].
         disk_each: a Gaussian on disk, with its share of the coarser levels and of the index [bytes].
         shared_process: memory of a process of the shared map without places [bytes].
         live_process: memory of a process of live maps without maps [bytes].
@@ -52,12 +53,17 @@ class Costs:
     """
 
     requests: Mapping[str, RequestCost]
-    place_memory: float
-    place_read: float
+    place_tiles: float
+    place_fields: float
     disk_each: float
     shared_process: float
     live_process: float
     live_map: float
+
+    @property
+    def place_cache(self) -> float:
+        """Memory of a place in the larger one of the two caches, both of which SPLATBOT_TILES_MB limits [bytes]."""
+        return max(self.place_tiles, self.place_fields)
 
     def add_to(self, results: Results) -> None:
         """Append the costs as rows."""
@@ -91,17 +97,25 @@ class Costs:
         return Costs(requests, **{name: scale * value(case, m) for name, (case, m, _, scale) in _SINGLE.items()})
 
 
-def read_costs(file: Path) -> Costs:
-    """Read the costs of an earlier run.
+def read_measurement(file: Path) -> Results:
+    """Read the machine and the rows of an earlier run, without its plan and its simulation.
 
     Raises:
-        FormatError: the file cannot be read, or lacks a cost.
+        FormatError: the file cannot be read, or is not of a benchmark.
     """
     hint = "give sizing.json of a run without --costs"
     try:
-        rows = [Row(**row) for row in json.loads(file.read_text(encoding="utf-8"))["rows"]]
+        found = json.loads(file.read_text(encoding="utf-8"))
+        machine, rows = found["machine"], [Row(**row) for row in found["rows"]]
+        results = Results({name: machine[name] for name in _MACHINE} | machine)
     except OSError as error:
         raise FormatError(f"cannot be read ({error.strerror}).", file=file, hint=hint) from error
     except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise FormatError("has no rows of a benchmark.", file=file, hint=hint) from error
-    return Costs.of_rows(rows, file)
+        raise FormatError("has no machine and rows of a benchmark.", file=file, hint=hint) from error
+    results.rows = [row for row in rows if is_measured(row)]
+    return results
+
+
+def is_measured(row: Row) -> bool:
+    """Return whether a row is measured, and not of the plan or of its simulation."""
+    return not row.case.startswith(("plan:", "simulated "))

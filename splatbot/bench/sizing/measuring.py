@@ -6,7 +6,8 @@ import json
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -24,9 +25,9 @@ from splatbot.bench.sizing.costs import COLLISIONS, DISTANCE, FRAME, PLACE, PLAN
 from splatbot.client import Client, ServiceError, pack_array
 from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.errors import SplatbotError
-from splatbot.frame import Frame
 from splatbot.gaussians import GaussianModel
 from splatbot.logs import open_log
+from splatbot.planning import PlanStatus
 from splatbot.robots.panda import panda
 from splatbot.services.tiled_fields import field_around
 from splatbot.serving import Serving, serving
@@ -38,8 +39,10 @@ _EXTENT, _HEIGHT, _ROOM, _SIZE = 20.0, 3.0, 4.0, 0.03  # [m] of a building of 2 
 _POINTS, _CONFIGURATIONS = 100, 20  # of a request
 _IN_MEMORY = 200_000  # Gaussians of the map in memory
 _PLAN_MS, _BASE = 100.0, {"translation": [0.0, 0.5, 0.0]}
-_GOAL = np.array([0.3, -0.8, 0.0, -2.3, 0.0, 1.6, 0.8])  # [rad] of a Panda; plans end around it
+_BEFORE_WALL = {"translation": [-0.8, -0.4, 1.0], "quaternion_wxyz": [0.70710678, -0.70710678, 0.0, 0.0]}
+_BESIDE_WALL = np.array([1.0, 0.3, 0.0, -1.5, 0.0, 1.9, 0.8])  # [rad] of a Panda; a plan turns it to the other side
 _PACKED = {"Content-Type": "application/msgpack", "Accept": "application/msgpack"}
+_JSON = {"Content-Type": "application/json"}
 _MIB = 2**20
 
 
@@ -55,7 +58,7 @@ def measure_costs(settings: SizingSettings, results: Results, report_progress: R
         model = simulated_building(settings.measured)
         write_tiles(model, folder / "tiles", source="simulated building")
         places = _places(settings)
-        memory, read = _measure_places(folder / "tiles", places)
+        place_tiles, place_fields = _measure_places(folder / "tiles", places)
         results.add(
             "Gaussian",
             "memory",
@@ -67,8 +70,9 @@ def measure_costs(settings: SizingSettings, results: Results, report_progress: R
         report_progress("queries of the tiled map")
         requests, shared = _measure_shared(settings, results, folder / "tiles", places)
         report_progress("frames and plans")
-        more, live, map_bytes = _measure_live(settings, results, folder / "maps")
-        return Costs({**more, **requests}, memory, read, disk, shared, live, map_bytes)
+        wall().save(folder / "wall.ply")
+        more, live, map_bytes = _measure_live(settings, results, folder)
+        return Costs({**more, **requests}, place_tiles, place_fields, disk, shared, live, map_bytes)
 
 
 def simulated_building(count: int, seed: int = 0) -> GaussianModel:
@@ -91,6 +95,28 @@ def simulated_building(count: int, seed: int = 0) -> GaussianModel:
     return replace(model, observations=model.observations + 9)
 
 
+def wall() -> GaussianModel:
+    """Return a wall of discs, 1 m square, around which the arm plans."""
+    x, y = (axis.ravel() for axis in np.meshgrid(*[np.linspace(-0.5, 0.5, 51)] * 2))
+    return GaussianModel.from_activated(
+        means=np.stack([x, y, np.ones(len(x))], axis=-1),
+        quats=np.tile((1.0, 0.0, 0.0, 0.0), (len(x), 1)),
+        scales=np.tile((0.015, 0.015, 0.001), (len(x), 1)),
+        opacities=np.full(len(x), 0.95),
+        colors=np.full((len(x), 3), 0.5),
+    )
+
+
+def plans_around_the_wall(count: int) -> list[dict[str, Any]]:
+    """Return requests for plans whose straight line meets the wall, so that each search uses its budget."""
+    starts = _BESIDE_WALL + np.random.default_rng(4).uniform(-0.05, 0.05, (count, len(_BESIDE_WALL)))
+    goals = starts * np.array([-1.0, *[1.0] * (len(_BESIDE_WALL) - 1)])
+    return [
+        {"start": start, "goal": goal, "base": _BEFORE_WALL, "budget_ms": _PLAN_MS}
+        for start, goal in zip(starts.tolist(), goals.tolist(), strict=True)
+    ]
+
+
 def _memory_each(count: int) -> float:
     """Return the memory of a Gaussian of a map in memory, with its share of the collision field [bytes]."""
     model = simulated_building(count)
@@ -98,9 +124,9 @@ def _memory_each(count: int) -> float:
 
 
 def _places(settings: SizingSettings) -> Array:
-    """Return places (P, 3) [m] on the floor of the building."""
+    """Return places (P, 3) [m] on the floor of the building, the first one for the first query of the process."""
     side = _EXTENT * np.sqrt(settings.measured / 2e6)
-    across = np.random.default_rng(1).uniform(0.1 * side, 0.9 * side, (max(3, settings.requests // 4), 2))
+    across = np.random.default_rng(1).uniform(0.1 * side, 0.9 * side, (1 + max(3, settings.requests // 4), 2))
     return np.column_stack([across, np.full(len(across), 0.1)])
 
 
@@ -118,24 +144,24 @@ def _pose(place: Array) -> dict[str, list[float]]:
 
 
 def _measure_places(folder: Path, places: Array) -> tuple[float, float]:
-    """Return the memory and the tiles of a place [bytes], as the routes of the service load them."""
-    with TiledMap(folder, memory_mb=1e5) as tiles:
-        read = []
-        for place in places:
-            with TiledMap(folder, memory_mb=1e5) as alone:
-                field_around(alone, _points(place), "points")
-                _arm_field(alone, place)
-                read.append(alone.nbytes - alone.fields.nbytes)
-            field_around(tiles, _points(place), "points")
-            _arm_field(tiles, place)
-        return tiles.fields.nbytes / len(places) + float(np.mean(read)), float(np.mean(read))
+    """Return the tiles and the fields of a place in memory [bytes], as the routes of the service query them."""
+    found = []
+    for place in places:
+        with TiledMap(folder, memory_mb=1e5) as tiles:
+            points, arm = _points(place), _arm(place)
+            field_around(tiles, points, "points").mahalanobis(points)
+            centres = arm.centers(_configurations()).reshape(-1, 3)
+            around = field_around(tiles, centres, "q", room=float(arm.spheres.radii.max()))
+            arm.check(around.field, _configurations())
+            found.append((tiles.nbytes - tiles.fields.nbytes, tiles.fields.nbytes))
+    in_tiles, in_fields = np.mean(found, axis=0)
+    return float(in_tiles), float(in_fields)
 
 
-def _arm_field(tiles: TiledMap, place: Array) -> None:
+def _arm(place: Array) -> RobotSpheres:
     T = np.eye(4)
     T[:3, 3] = place
-    arm = RobotSpheres(panda(), T_world_base=T)
-    field_around(tiles, arm.centers(_configurations()).reshape(-1, 3), "q", room=float(arm.spheres.radii.max()))
+    return RobotSpheres(panda(), T_world_base=T)
 
 
 def _measure_shared(
@@ -144,33 +170,32 @@ def _measure_shared(
     """Return the costs of queries of a served tiled map, and the memory of its process [bytes]."""
     begin = time.perf_counter()
     log = settings.folder / "shared.log"
-    with serving("--map", str(folder), log=log) as service, Client(service.url) as client:
+    with serving("--map", str(folder), log=log) as service, closing(_CountingClient(service.url)) as client:
         results.add("process of the shared map", "start", time.perf_counter() - begin, "s")
         process_bytes = _resident(service.process)
 
-        def distance(place: Array) -> tuple[int, int]:
-            return _post(client, "distance", {"points": _points(place)})
+        def distance(place: Array) -> None:
+            _post(client, "distance", {"points": _points(place)})
 
-        def collisions(place: Array) -> tuple[int, int]:
-            return _post(client, "collisions", {"q": _configurations(), "base": _pose(place)})
+        def collisions(place: Array) -> None:
+            _post(client, "collisions", {"q": _configurations(), "base": _pose(place)})
+
+        def both(place: Array) -> None:
+            distance(place)
+            collisions(place)
 
         begin = time.perf_counter()
         distance(places[0])
         results.add("process of the shared map", "first query", 1e3 * (time.perf_counter() - begin), "ms")
-
-        def both(place: Array) -> tuple[int, int]:
-            first, second = distance(place), collisions(place)
-            return first[0] + second[0], first[1] + second[1]
-
-        costs = {PLACE: _cost(service, results, PLACE, [partial(both, place) for place in places])}
+        costs = {PLACE: _cost(service, client, results, PLACE, [partial(both, place) for place in places[1:]])}
         for kind, ask in ((DISTANCE, distance), (COLLISIONS, collisions)):
-            ask(places[0])
-            costs[kind] = _cost(service, results, kind, [partial(ask, places[0])] * settings.requests)
+            ask(places[1])
+            costs[kind] = _cost(service, client, results, kind, [partial(ask, places[1])] * settings.requests)
         return costs, process_bytes
 
 
 def _measure_live(
-    settings: SizingSettings, results: Results, data: Path
+    settings: SizingSettings, results: Results, folder: Path
 ) -> tuple[dict[str, RequestCost], float, float]:
     """Return the costs of frames and plans, and the memory of the process and of a robot's map [bytes].
 
@@ -179,56 +204,61 @@ def _measure_live(
     frames = list(open_log(settings.log))
     begin = time.perf_counter()
     log = settings.folder / "live.log"
-    with serving("--data", str(data), log=log) as service, Client(service.url) as client:
+    given = ("--data", str(folder / "maps"), "--map", str(folder / "wall.ply"))
+    with serving(*given, log=log) as service, closing(_CountingClient(service.url)) as client:
         results.add("process of live maps", "start", time.perf_counter() - begin, "s")
         before, costs = [], {}
         for name in ("first", "second"):
             before.append(_resident(service.process))
             client.create_map(name, robot_base=_BASE)
-            pushes = [partial(_push, client, name, frame) for frame in frames]
-            costs[FRAME] = _cost(service, results, FRAME, pushes)
+            pushes = [partial(client.push, name, frame) for frame in frames]
+            costs[FRAME] = _cost(service, client, results, FRAME, pushes)
         map_bytes = max(0.0, _resident(service.process) - before[1])
-        goals = _GOAL + np.random.default_rng(4).uniform(-0.6, 0.6, (max(2, settings.requests // 5), len(_GOAL)))
-        plans = [partial(_plan, client, {"goal": goal, "budget_ms": _PLAN_MS}) for goal in goals.tolist()]
-        costs[PLAN] = _cost(service, results, PLAN, plans)
+        plans = [partial(_plan, client, body) for body in plans_around_the_wall(max(2, settings.requests // 5))]
+        costs[PLAN] = _cost(service, client, results, PLAN, plans)
         return costs, before[1] - map_bytes, map_bytes
 
 
+class _CountingClient(Client):
+    """A client that counts the bytes of the bodies that it sends and receives."""
+
+    sent = received = 0
+
+    def request(
+        self, method: str, path: str, body: bytes | None = None, headers: Mapping[str, str] | None = None
+    ) -> tuple[bytes, Mapping[str, str]]:
+        self.sent += len(body or b"")
+        answer, fields = super().request(method, path, body, headers)
+        self.received += len(answer)
+        return answer, fields
+
+
 def _cost(
-    service: Serving, results: Results, kind: str, requests: Sequence[Callable[[], tuple[int, int]]]
+    service: Serving, client: _CountingClient, results: Results, kind: str, requests: Sequence[Callable[[], object]]
 ) -> RequestCost:
-    """Send requests one after the other, which return the sizes of their bodies; append their median latency."""
-    before, seconds, sizes = _cpu(service.process), [], []
+    """Send requests one after the other, and append their median latency."""
+    cpu, sent, received = _cpu(service.process), client.sent, client.received
+    seconds = []
     for send in requests:
         begin = time.perf_counter()
-        sizes.append(send())
+        send()
         seconds.append(time.perf_counter() - begin)
-    cpu = (_cpu(service.process) - before) / len(requests)
     results.add(kind, "latency p50", 1e3 * float(np.median(seconds)), "ms")
-    received, sent = np.mean(sizes, axis=0)
-    return RequestCost(cpu, float(received), float(sent))
+    cpu, count = _cpu(service.process) - cpu, len(requests)
+    return RequestCost(cpu / count, (client.sent - sent) / count, (client.received - received) / count)
 
 
-def _post(client: Client, route: str, body: dict[str, Any]) -> tuple[int, int]:
-    sent = msgpack.packb(body, default=pack_array)
-    answer, _ = client.request("POST", f"/v1/maps/default/{route}", sent, _PACKED)
-    return len(sent), len(answer)
+def _post(client: Client, route: str, body: dict[str, Any]) -> None:
+    client.request("POST", f"/v1/maps/default/{route}", msgpack.packb(body, default=pack_array), _PACKED)
 
 
-def _plan(client: Client, body: dict[str, Any]) -> tuple[int, int]:
-    sent = json.dumps(body).encode()
+def _plan(client: Client, body: dict[str, Any]) -> None:
+    """Plan; a search that finds no path in its budget costs as much."""
     try:
-        answer, _ = client.request("POST", "/v1/maps/second/plans", sent, {"Content-Type": "application/json"})
+        client.request("POST", "/v1/maps/default/plans", json.dumps(body).encode(), _JSON)
     except ServiceError as error:
-        if error.status != 422:
+        if error.code != PlanStatus.TIMED_OUT:
             raise
-        return len(sent), 0  # the search for a path costs as much without one
-    return len(sent), len(answer)
-
-
-def _push(client: Client, map_id: str, frame: Frame) -> tuple[int, int]:
-    client.push(map_id, frame)
-    return frame.rgb.nbytes + frame.depth.nbytes, 0
 
 
 def _resident(process: subprocess.Popen[str]) -> float:

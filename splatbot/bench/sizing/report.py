@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -11,7 +12,7 @@ from splatbot.bench.benchmark import ReportProgress
 from splatbot.bench.machine import describe_machine
 from splatbot.bench.results import Results
 from splatbot.bench.sizing import SizingSettings, gigabits
-from splatbot.bench.sizing.costs import COLLISIONS, DISTANCE, FRAME, PLACE, PLAN, Costs, read_costs
+from splatbot.bench.sizing.costs import COLLISIONS, DISTANCE, FRAME, PLACE, PLAN, Costs, read_measurement
 from splatbot.bench.sizing.fleet import Fleet, FleetPlan, most_robots, plan_fleet, utilisation
 from splatbot.bench.sizing.measuring import measure_costs
 from splatbot.bench.sizing.queueing import RequestStream, SimulatedNode, simulate_node
@@ -22,10 +23,14 @@ _CURVE = np.geomspace(0.01, 4.0, 60)
 
 def run_sizing(settings: SizingSettings, report_progress: ReportProgress) -> Results:
     """Measure or read the costs, plan the fleet of the settings, and simulate one of its nodes."""
-    results = Results(describe_machine((1,), peak_ms=settings.peak_ms))
-    costs = read_costs(settings.costs) if settings.costs else measure_costs(settings, results, report_progress)
-    costs.add_to(results)
-    settings.save(results)
+    if settings.costs:
+        results = read_measurement(settings.costs)
+        costs = Costs.of_rows(results.rows, settings.costs)
+    else:
+        results = Results(describe_machine((1,), peak_ms=settings.peak_ms))
+        costs = measure_costs(settings, results, report_progress)
+        costs.add_to(results)
+        settings.save(results)
     fleet = _fleet(settings)
     plan = plan_fleet(costs, fleet)
     _add_plan(results, costs, fleet, plan)
@@ -33,12 +38,13 @@ def run_sizing(settings: SizingSettings, report_progress: ReportProgress) -> Res
     node = fleet.robots / plan.nodes
     _add_simulation(results, "node", costs, fleet, fleet.rates, node, fleet.cores, settings.simulated)
     for name, processes, kinds in (
-        ("process of a shard", plan.shards * plan.replicas, (COLLISIONS, DISTANCE, PLACE)),
+        ("process of a shard", plan.shared_processes, (COLLISIONS, DISTANCE, PLACE)),
         ("process of live maps", plan.live_processes, (FRAME, PLAN)),
     ):
         rates = {kind: fleet.rates[kind] for kind in kinds}
         if any(rates.values()):
-            _add_simulation(results, name, costs, fleet, rates, fleet.robots / processes, 1, settings.simulated)
+            each = math.ceil(fleet.robots / processes)  # whole robots
+            _add_simulation(results, name, costs, fleet, rates, each, 1, settings.simulated)
     counts = (_CURVE * fleet.robots).tolist()
     curves = [utilisation(costs, fleet, plan, count) for count in counts]
     results.curves = {"robots": counts, "planned": fleet.robots, "utilisation": curves}
@@ -70,15 +76,16 @@ def _add_plan(results: Results, costs: Costs, fleet: Fleet, plan: FleetPlan) -> 
         ("robots", fleet.robots, ""),
         ("shards", plan.shards, ""),
         ("processes of each shard", plan.replicas, ""),
-        ("processes of the shared map", plan.shards * plan.replicas, ""),
+        ("processes of the shared map", plan.shared_processes, ""),
         ("processes of live maps", plan.live_processes, ""),
         ("nodes", plan.nodes, ""),
         ("balancers", plan.balancers, ""),
-        ("SPLATBOT_TILES_MB", plan.tiles / 1e6, "MB"),
         ("memory of a node in use", use["memory"] * fleet.memory / 1e9, "GB"),
         ("disk of a node in use", use["disk"] * fleet.disk / 1e9, "GB"),
     ):
         results.add("plan: fleet", metric, float(value), unit)
+    tiles = plan.tiles / 1e6 if plan.tiles else None
+    results.add("plan: fleet", "SPLATBOT_TILES_MB", tiles, "MB", note=None if plan.tiles else "the default")
     order = sorted(most, key=lambda name: most[name])
     results.add("plan: fleet", "saturates first", None, "", note=order[0])
     for name in order:
@@ -121,4 +128,4 @@ def _add_latencies(results: Results, case: str, found: SimulatedNode, rate: floa
     results.add(case, "requests/s", rate, "")
     for share in _SHARES:
         latency = 1e3 * float(np.percentile(found.latency, share)) if len(found.latency) else None
-        results.add(case, f"latency p{share}", latency, "ms", note=None if latency else "no request")
+        results.add(case, f"latency p{share}", latency, "ms", note="no request" if latency is None else None)
