@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +17,7 @@ from splatbot.grasping.reach import hand_of
 from splatbot.planning.causes import collision
 from splatbot.planning.ik import ArmWithTool, solve_ik
 from splatbot.planning.problem import Cause
-from splatbot.protocols import Array, RobotKinematics
+from splatbot.protocols import Array, LinkSpheres, RobotKinematics
 from splatbot.segmentation import MapObject, SegmentedMap
 
 
@@ -51,44 +52,79 @@ class Obstacle:
     reason: str
 
 
+class _Palm:
+    """The hand of an arm without its fingers, which are the spheres that the opening moves, as a robot for checks."""
+
+    def __init__(self, robot: RobotKinematics) -> None:
+        self.name, self.chain, self.home = robot.name, robot.chain, robot.home
+        self.self_collision_pairs = np.zeros((0, 2), np.int32)
+        wide, closed = robot.spheres(), robot.spheres(0.0)
+        keep = (wide.link == len(robot.chain)) & (wide.centers == closed.centers).all(axis=1)
+        self._spheres = LinkSpheres(wide.link[keep], wide.centers[keep], wide.radii[keep])
+
+    def spheres(self, opening: float | None = None) -> LinkSpheres:
+        """Return the spheres, the same for every opening."""
+        return self._spheres
+
+
+@dataclass(frozen=True, eq=False)
+class _Check:
+    """Check of the spheres of some links against obstacles.
+
+    Args:
+        spheres: the links.
+        field: the obstacles.
+        name: their name.
+    """
+
+    spheres: RobotSpheres
+    field: GaussianCollisionField
+    name: str
+
+
 class _Clearance:
     """Check of postures against the map without an object, and against the arm itself.
 
-    The links before the hand keep the margin. The hand is as open as the object requires. It keeps no margin, and may
-    touch the support of the object, because the height of a grasp is not known yet.
+    The links before the hand keep the margin. The hand is as open as the object requires, and keeps no margin. From
+    above its fingers may touch the support of the object, because the height of a grasp is not known yet.
     """
 
     def __init__(
         self, scene: SegmentedMap, item: MapObject, robot: RobotKinematics, margin: float, solids: GaussianModel | None
     ) -> None:
         around = around_target(scene, item.rows)
-        of_links = around if solids is None else GaussianModel.concatenate([around, solids])
-        of_hand = around_target(scene, np.concatenate([item.rows, _rows_of_support(scene, item)]))
+        whole = GaussianCollisionField(around if solids is None else GaussianModel.concatenate([around, solids]))
+        of_fingers = around_target(scene, np.concatenate([item.rows, _rows_of_support(scene, item)]))
         opening = min(float(item.size[1]) + 2 * HANDS.min_pad_gap, hand_of(robot).stroke)
         arm = RobotSpheres(robot, T_world_base=scene.T_world_base, opening=opening)
-        self._checks = (
-            (arm, GaussianCollisionField(of_hand), "the map"),
-            (
-                arm.without_hand(margin),
-                GaussianCollisionField(of_links),
-                f"the map or its {1e3 * margin:.1f} mm margin",
-            ),
-        )
-        self._met: list[Array] = []
+        palm = RobotSpheres(_Palm(robot), T_world_base=scene.T_world_base)
+        links = _Check(arm.without_hand(margin), whole, f"the map or its {1e3 * margin:.1f} mm margin")
+        fingers = _Check(arm, GaussianCollisionField(of_fingers), "the map")
+        self._from_above = (fingers, _Check(palm, whole, "the map"), links)
+        self._level = (_Check(arm, whole, "the map"), links)
+        self._met: list[tuple[Array, tuple[_Check, ...]]] = []
 
-    def free(self, q: Array) -> NDArray[np.bool_]:
-        """Return whether each configuration (K, J) is free; the first ones that are not are kept."""
-        meets = np.any([spheres.check(field, q).in_collision for spheres, field, _ in self._checks], axis=0)
-        self._met.extend(q[meets][: CONSTANTS.causes - len(self._met)])
-        return np.asarray(~meets)
+    def free_at(self, T_base_tool: Array) -> Callable[[Array], NDArray[np.bool_]]:
+        """Return a function that checks postures (K, J) which place the tool at a pose (4, 4): free or not (K,).
+
+        The first postures that are not free are kept for :meth:`cause`.
+        """
+        checks = self._from_above if T_base_tool[2, 2] < -0.5 else self._level
+
+        def free(q: Array) -> NDArray[np.bool_]:
+            meets = np.any([check.spheres.check(check.field, q).in_collision for check in checks], axis=0)
+            self._met.extend((each, checks) for each in q[meets][: CONSTANTS.causes - len(self._met)])
+            return np.asarray(~meets)
+
+        return free
 
     def cause(self) -> str | None:
         """Return the deepest contact of the posture in which it is least deep, or None if no posture was found."""
         if not self._met:
             return None
         deepest = [
-            max(((collision(spheres, field, q), where) for spheres, field, where in self._checks), key=_depth)
-            for q in self._met
+            max(((collision(check.spheres, check.field, q), check.name) for check in checks), key=_depth)
+            for q, checks in self._met
         ]
         least, where = min(deepest, key=_depth)
         return least.deep_in(where) if least.gaussian >= 0 else str(least)
@@ -117,6 +153,7 @@ def out_of_reach(
 
     The tool is at most as far from the first joint as all links in line. Nearer objects need a free posture that places
     the tool at the centre, with an approach from above, from the front or from a side. The object is no obstacle.
+    From above, the fingers may be in its support, and the rest of the hand may not.
 
     Args:
         scene: the segmented map.
@@ -134,7 +171,7 @@ def out_of_reach(
         return Obstacle("too far", f"it is {away:.2f} m from the first joint, and the arm reaches {reach:.2f} m")
     clear = _Clearance(scene, item, robot, margin, solids)
     seeds, starts = CONSTANTS.seeds, CONSTANTS.starts
-    if any(len(solve_ik(robot, T, seeds=seeds, most=starts, free=clear.free).q) for T in _approaches(center)):
+    if any(len(solve_ik(robot, T, seeds=seeds, most=starts, free=clear.free_at(T)).q) for T in _approaches(center)):
         return None
     cause = clear.cause()
     if cause is None:
