@@ -282,6 +282,10 @@ def test_the_costs_of_two_services_are_measured(tmp_path: Path) -> None:
     for kind in (*KINDS, PLACE):
         assert (results.find(kind, "latency p50") or 0) > 0.1, kind
         assert (results.find(kind, "request") or 0) > 0.01, kind
+    assert (results.find("frame", "request") or 0) > 160 * 120 * (
+        3 + 4
+    ) / 1e3  # colour and depth, and the rest of the body
+    assert (results.find("frame", "answer") or 0) > 0.1
     assert 76.0 + 56.0 < (results.find("Gaussian", "memory") or 0) < 1000.0
     assert 76.0 < (results.find("Gaussian", "disk") or 0) < 250.0
     assert (results.find("process of the shared map", "memory") or 0) > 100.0
