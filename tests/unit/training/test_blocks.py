@@ -250,6 +250,19 @@ def test_two_blocks_look_as_one_scene_and_an_interrupted_training_of_them_ends_w
 
 
 @pytest.mark.long
+def test_blocks_of_fixed_gaussians_keep_their_number_and_use_all_views(tmp_path: Path) -> None:
+    scene = write_wide_scene(tmp_path / "scene", points=1000, rows=4)
+    out = tmp_path / "out"
+    words = ("--iterations", "60", "--blocks", "4", "--strategy", "fixed", "--max-gaussians", "1000")
+    process = start(str(scene), *words, "--out", str(out))
+    _, err = process.communicate(timeout=240)
+    assert process.returncode == 0, err
+    assert scores_of(out)["gaussians"] == 1000
+    blocks = [TrainingFolder(out / "blocks" / str(number)).load_settings().block for number in range(4)]
+    assert len({name for block in blocks if block is not None for name in block.views}) == 14  # two are held out
+
+
+@pytest.mark.long
 def test_a_killed_block_ends_the_command_with_one_error(tmp_path: Path) -> None:
     scene = write_wide_scene(tmp_path / "scene", points=1000, rows=4)
     out = tmp_path / "out"

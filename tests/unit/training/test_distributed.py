@@ -23,6 +23,7 @@ import pytest
 import torch
 
 from splatbot.cli import main
+from splatbot.cli.train import _resumable
 from splatbot.errors import InputError
 from splatbot.gaussians import GaussianModel
 from splatbot.optimize.adam import PARAMETERS
@@ -283,6 +284,16 @@ def test_the_wrong_input_of_a_helper_is_that_of_the_command() -> None:
     ):
         pass
     assert "--resume" not in str(caught.value)
+
+
+def test_resume_is_the_fix_of_a_lost_process_only_with_a_checkpoint_of_this_training(tmp_path: Path) -> None:
+    folder, hints = TrainingFolder(tmp_path), []
+    folder.save_checkpoint({})  # of an earlier training, which --overwrite replaces
+    for begun in (False, True):
+        with pytest.raises(LostProcessError) as caught, _resumable(folder, [begun].pop):
+            raise LostProcessError("process 1 of 2 was ended by SIGKILL.")
+        hints.append(caught.value.hint)
+    assert hints == [None, f"`splatbot train --resume {tmp_path}` continues from the last checkpoint"]
 
 
 def test_a_process_that_nobody_meets_ends_with_the_time_that_it_waited(
