@@ -150,8 +150,8 @@ def _verdicts(item: ListedObject) -> tuple[str, str]:
 
 _MEANINGS = {
     "fits": "the hand encloses it by its size; splatbot grasp also checks its sides and surroundings",
-    "yes": "a posture of the arm takes the tool to its centre, clear of the map without the object; from above, fingers "
-    "may be in its support",
+    "yes": "a posture takes the tool to its centre, free of the map without it; from above, fingers may be in its "
+    "support",
     "blocked": "each posture found for the tool at its centre meets the map or the arm; --json names the contact",
     "no hand": "the robot has no hand; --robot takes one that has",
     "too flat": "lower than 12 mm, so that no hand encloses it",
