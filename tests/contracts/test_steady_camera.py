@@ -49,6 +49,7 @@ def errors(results: list[FrameResult], log: Log) -> np.ndarray:
     return np.array([np.linalg.norm((first @ truth.T_world_camera[k])[:3, 3] - T[:3, 3]) for k, T in tracked])
 
 
+@pytest.mark.long
 def test_drops_noise_a_stall_and_an_unplugged_device_cost_only_their_frames(log: Log) -> None:
     options = ReplayOptions(
         drop=0.05, corrupt=0.035, stall=30, stall_s=2.0, unplug=60, replug_s=1.5, fault_seed=7, speed=0.5

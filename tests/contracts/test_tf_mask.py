@@ -172,6 +172,7 @@ def test_depth_of_another_camera_is_mapped_at_its_own_pixels_once_its_tf_has_com
         frames.close()
 
 
+@pytest.mark.long
 def test_the_arm_stays_out_of_a_recording_with_tf_alone_that_a_client_or_the_command_names(tmp_path: Path) -> None:
     log = static_log(1.4)
     bag = record_ros(tmp_path / "tf", log)

@@ -36,6 +36,7 @@ def test_ctrl_c_is_the_normal_end_of_a_mapped_camera(tmp_path: Path) -> None:
     assert metrics["tracked"] + metrics["dropped"] <= len(recording) == metrics["log"]["frames"]
 
 
+@pytest.mark.long
 def test_a_mapped_camera_is_its_recording_for_other_commands(tmp_path: Path) -> None:
     out = tmp_path / "run"
     assert main(["map", CAMERA, "--out", str(out), "--max-frames", "24", "--quiet"]) == 0

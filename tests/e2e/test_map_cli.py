@@ -157,7 +157,7 @@ def test_the_map_is_rendered_near_to_what_the_camera_saw(sound_run: Path, sound_
     assert 10 * np.log10(255**2 / mse) > 20
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.long)])
 def test_an_interrupt_saves_what_was_mapped(sound_log: Path, tmp_path: Path, number: signal.Signals) -> None:
     process = start(sound_log, tmp_path / "run")
     wait_for_frame(process)
