@@ -235,9 +235,8 @@ class Tracker:
         if pose.verdict == "lost":
             return pose, uncertainty
         stamp = prepared.frame.stamp
-        if (
-            pose.weak is not None and self._filter.predict(stamp) is None
-        ):  # the pose is filled, and has no better motion
+        measures_motion = pose.weak is None and self.config.sensor.readout > 0
+        if self._filter.predict(stamp) is None and not measures_motion:
             covariance = self.variance_scale * pose.covariance
             self._filter.update(CameraMotion.at_pose(stamp, pose.T_world_camera, covariance))
             return pose, uncertainty
