@@ -165,12 +165,19 @@ def merged(parts: Sequence[tuple[SceneBlock, Path, Path | None]]) -> GaussianMod
 
 def _owned(part: tuple[SceneBlock, Path, Path | None]) -> GaussianModel:
     block, file, start = part
+    owned = None if start is None else _held(block, GaussianModel.load(start))  # one model in memory at a time
     model = GaussianModel.load(file)
-    places = model.means if start is None else GaussianModel.load(start).means
-    if len(places) != len(model):
+    if owned is None:
+        owned = _held(block, model)
+    if len(owned) != len(model):
         hint = "train the block again: remove its checkpoint.pt and scores.json, then --resume"
-        raise FormatError(f"has {len(model)} Gaussians, its start {len(places)}.", file=file, hint=hint)
-    return model.select(torch.from_numpy(block.holds(places.double().numpy())))
+        raise FormatError(f"has {len(model)} Gaussians, its start {len(owned)}.", file=file, hint=hint)
+    return model.select(owned)
+
+
+def _held(block: SceneBlock, model: GaussianModel) -> torch.Tensor:
+    """Return whether each Gaussian (N,) has its centre in the block."""
+    return torch.from_numpy(block.holds(model.means.double().numpy()))
 
 
 def in_view(view: TrainingView, points: Array) -> Mask:
