@@ -18,22 +18,14 @@ from splatbot.gaussians import GaussianModel
 from splatbot.results.folder import RunFolder
 from splatbot.training.folder import TrainingFolder
 from splatbot.trajectory import Trajectory
-from tests.unit.training.rendered import CAMERA, rendered_data
+from tests.unit.training.rendered import write_blender_scene
 from tests.waiting import until
 
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A Blender scene of 10 photographs with alpha."""
-    folder = tmp_path_factory.mktemp("blender")
-    frames = []
-    for view in rendered_data(10).views:
-        cv2.imwrite(str(folder / f"{view.name}.png"), cv2.cvtColor(view.read(), cv2.COLOR_RGBA2BGRA))
-        T = view.T_world_camera @ np.diag([1.0, -1.0, -1.0, 1.0])
-        frames.append({"file_path": f"./{view.name}", "transform_matrix": T.tolist()})
-    angle = 2 * np.arctan(0.5 * CAMERA.width / CAMERA.fx)
-    (folder / "transforms_train.json").write_text(json.dumps({"camera_angle_x": float(angle), "frames": frames}))
-    return folder
+    return write_blender_scene(tmp_path_factory.mktemp("blender"), 10)
 
 
 def start(*words: str) -> subprocess.Popen[str]:

@@ -75,16 +75,30 @@ def measure_costs(settings: SizingSettings, results: Results, report_progress: R
         return Costs({**more, **requests}, place_tiles, place_fields, disk, shared, live, map_bytes)
 
 
-def simulated_building(count: int, seed: int = 0) -> GaussianModel:
-    """Return discs on floors, ceilings and walls of rooms, 5,000 of them a square metre of floor."""
-    rng = np.random.default_rng(seed)
-    side = _EXTENT * np.sqrt(count / 2e6)
+def building_discs(rng: np.random.Generator, count: int, side: float, size: float) -> tuple[Array, Array]:
+    """Draw discs on floors, ceilings and walls of the rooms of a building.
+
+    Args:
+        rng: source of random numbers.
+        count: number N of discs.
+        side: side of the square floor [m].
+        size: median standard deviation of the two long axes [m].
+
+    Returns:
+        Centres (N, 3) [m] and standard deviations (N, 3) [m] along the axes of the building.
+    """
     kind, means = rng.integers(0, 4, count), rng.uniform(0.0, 1.0, (count, 3)) * (side, side, _HEIGHT)
     means[kind == 0, 2], means[kind == 1, 2] = 0.0, _HEIGHT
     for axis, walls in ((0, kind == 2), (1, kind == 3)):
         means[walls, axis] = _ROOM * np.round(means[walls, axis] / _ROOM)
-    scales = _SIZE * np.exp(rng.normal(0.0, 0.3, (count, 3)))
-    scales[np.arange(count), np.array([2, 2, 0, 1])[kind]] = 0.05 * _SIZE
+    scales = size * np.exp(rng.normal(0.0, 0.3, (count, 3)))
+    scales[np.arange(count), np.array([2, 2, 0, 1])[kind]] = 0.05 * size
+    return means, scales
+
+
+def simulated_building(count: int, seed: int = 0) -> GaussianModel:
+    """Return discs on floors, ceilings and walls of rooms, 5,000 of them a square metre of floor."""
+    means, scales = building_discs(np.random.default_rng(seed), count, _EXTENT * np.sqrt(count / 2e6), _SIZE)
     model = GaussianModel.from_activated(
         means=means,
         quats=np.tile((1.0, 0.0, 0.0, 0.0), (count, 1)),

@@ -31,11 +31,11 @@ from splatbot.bench.tracking.peers import Odometry, tracking_peers
 from splatbot.bench.tracking.stress import run_stress
 from splatbot.calibration.timing import with_estimated_timing
 from splatbot.config import Config, load_config, with_sensor
-from splatbot.evaluation import absolute_error, relative_error
+from splatbot.evaluation import relative_error
 from splatbot.frame import Frame
 from splatbot.logs import Log, open_log
 from splatbot.protocols import Array
-from splatbot.results.scoring import score_trajectory
+from splatbot.results.scoring import score_trajectory, trajectory_metrics
 from splatbot.slam import Slam
 from splatbot.trajectory import Trajectory
 
@@ -174,15 +174,14 @@ def add_rows(results: Results, log: Log, contender: Contender, outcome: Tracking
         for metric in (ATE, RPE, RPE_ROT):
             add(metric, None, "mm", why)
     else:
-        relative = relative_error(truth, tracked)
-        add(ATE, 1e3 * absolute_error(truth, tracked).rmse, "mm", contender.note)
-        add(RPE, 1e3 * relative.trans_rmse, "mm")
-        add(RPE_ROT, float(np.degrees(relative.rot_rmse)), "°")
+        score = trajectory_metrics(score_trajectory(tracked, truth, outcome.covariances))
+        ate, rpe = score["ate_rmse_m"], score["rpe_trans_rmse_m"]
+        add(ATE, None if ate is None else 1e3 * ate, "mm", contender.note if ate is not None else "no stamp matches")
+        add(RPE, None if rpe is None else 1e3 * rpe, "mm")
+        add(RPE_ROT, score["rpe_rot_rmse_deg"], "°")
         if outcome.covariances is not None:
-            score = score_trajectory(tracked, truth, outcome.covariances)
-            fitted, given = (score.consistency, score.consistency_as_given) if score else (None, None)
-            add(NEES, fitted.mean if fitted else None, "", None if fitted else "fewer than ten frames")
-            add(NEES_AS_GIVEN, given.mean if given else None, "")
+            add(NEES, score["nees"], "", "fewer than ten frames" if score["nees"] is None else None)
+            add(NEES_AS_GIVEN, score["nees_as_given"], "")
         if outcome.covariances is not None and outcome.accepted is not None:
             add(JUMPS, 100.0 * jumps_reported_ok(truth, tracked, outcome.covariances, outcome.accepted), "%")
     add(TRACKED, 100.0 * len(tracked) / outcome.frames, "%")

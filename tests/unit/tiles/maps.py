@@ -6,11 +6,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from splatbot.bench.sizing.measuring import building_discs
 from splatbot.gaussians import GaussianModel
 
 Array = NDArray[np.float64]
 
-SIDE, HEIGHT, ROOM = 12.0, 3.0, 4.0  # [m] of the building and its rooms
+SIDE, HEIGHT = 12.0, 3.0  # [m] of the building
 COLUMNS = ("means", "quats", "log_scales", "opacity_logits", "sh", "observations", "anchors", "uncertainty", "misses")
 
 
@@ -25,12 +26,7 @@ def building(n: int, *, seed: int = 0, side: float = SIDE, degree: int = 0, size
         size: median standard deviation of the two long axes [m].
     """
     rng = np.random.default_rng(seed)
-    kind, means = rng.integers(0, 4, n), rng.uniform(0.0, 1.0, (n, 3)) * (side, side, HEIGHT)
-    means[kind == 0, 2], means[kind == 1, 2] = 0.0, HEIGHT
-    for axis, walls in ((0, kind == 2), (1, kind == 3)):
-        means[walls, axis] = ROOM * np.round(means[walls, axis] / ROOM)
-    scales = size * np.exp(rng.normal(0.0, 0.3, (n, 3)))
-    scales[np.arange(n), np.array([2, 2, 0, 1])[kind]] = 0.05 * size
+    means, scales = building_discs(rng, n, side, size)
     model = GaussianModel.from_activated(
         means=means,
         quats=np.tile((2.0, 0.0, 0.0, 0.0), (n, 1)) + 0.05 * rng.normal(size=(n, 4)),

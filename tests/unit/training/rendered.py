@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from functools import partial
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -67,3 +69,15 @@ def rendered_data(count: int = 16, *, points: int = 0, depth: bool = False) -> T
     near = model.means.double().numpy()[rows] + rng.normal(scale=0.03, size=(points, 3))
     colors = np.rint(255 * model.colors.numpy()[rows]).astype(np.uint8)
     return TrainingData("blender", Path("rendered"), tuple(views), near, colors)
+
+
+def write_blender_scene(folder: Path, count: int) -> Path:
+    """Write a Blender scene of ``count`` photographs with alpha, and return its folder."""
+    frames = []
+    for view in rendered_data(count).views:
+        cv2.imwrite(str(folder / f"{view.name}.png"), cv2.cvtColor(view.read(), cv2.COLOR_RGBA2BGRA))
+        T = view.T_world_camera @ np.diag([1.0, -1.0, -1.0, 1.0])
+        frames.append({"file_path": f"./{view.name}", "transform_matrix": T.tolist()})
+    angle = 2 * np.arctan(0.5 * CAMERA.width / CAMERA.fx)
+    (folder / "transforms_train.json").write_text(json.dumps({"camera_angle_x": float(angle), "frames": frames}))
+    return folder

@@ -17,8 +17,6 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-import cv2
-import numpy as np
 import pytest
 import torch
 
@@ -35,7 +33,7 @@ from splatbot.training.initialize import initial_model
 from splatbot.training.options import TrainingOptions
 from splatbot.training.session import TrainingSession
 from splatbot.training.trainer import Trainer
-from tests.unit.training.rendered import CAMERA, rendered_data
+from tests.unit.training.rendered import rendered_data, write_blender_scene
 from tests.waiting import until
 
 OPTIONS: tuple[dict[str, Any], ...] = (
@@ -155,15 +153,7 @@ def test_the_shares_of_the_processes_hold_each_view_once() -> None:
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A Blender scene of 6 photographs with alpha."""
-    folder = tmp_path_factory.mktemp("blender")
-    frames = []
-    for view in rendered_data(6).views:
-        cv2.imwrite(str(folder / f"{view.name}.png"), cv2.cvtColor(view.read(), cv2.COLOR_RGBA2BGRA))
-        T = view.T_world_camera @ np.diag([1.0, -1.0, -1.0, 1.0])
-        frames.append({"file_path": f"./{view.name}", "transform_matrix": T.tolist()})
-    angle = 2 * np.arctan(0.5 * CAMERA.width / CAMERA.fx)
-    (folder / "transforms_train.json").write_text(json.dumps({"camera_angle_x": float(angle), "frames": frames}))
-    return folder
+    return write_blender_scene(tmp_path_factory.mktemp("blender"), 6)
 
 
 @pytest.mark.parametrize(
