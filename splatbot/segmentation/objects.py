@@ -123,8 +123,10 @@ class SegmentedMap:
 
     @cached_property
     def points(self) -> Array:
-        """Means (N, 3) of all Gaussians in the base's frame [m]."""
-        return transform_points(inverse(self.T_world_base), self.model.means.detach().double().numpy())
+        """Means (N, 3) of all Gaussians in the base's frame [m], read-only."""
+        points = transform_points(inverse(self.T_world_base), self.model.means.detach().double().numpy())
+        points.flags.writeable = False
+        return points
 
     @cached_property
     def solid(self) -> NDArray[np.bool_]:

@@ -141,10 +141,9 @@ def test_what_is_wider_than_the_hand_or_flat_is_not_offered() -> None:
 def test_what_hangs_in_the_air_is_told_from_what_stands() -> None:
     found = list_objects(scene(), panda())
     assert all(item.on_support for item in found)
-    raised = scene()
-    rows = raised.objects[0].rows
-    raised.points[rows, 2] += 0.1
-    lifted = list_objects(raised, panda())
+    above = scene().model.clone()
+    above.means[scene().objects[0].rows, 2] += 0.1
+    lifted = list_objects(replace(scene(), model=above), panda())
     assert [item.on_support for item in lifted] == [item.number != 0 for item in found]
 
 
