@@ -154,14 +154,17 @@ class Container:
         lines = Path(f"/proc/{self.pid}/status").read_text().splitlines()
         return {name: value.strip() for name, _, value in (line.partition(":") for line in lines)}
 
-    def stop(self) -> int:
+    def stop(self, within_s: float | None = None) -> int:
         """End it as `docker stop` does, and return its exit code.
+
+        Args:
+            within_s: [s] after which an engine would kill it, that of the recipe by default.
 
         Raises:
             subprocess.TimeoutExpired: an engine would kill it.
         """
         os.kill(self.pid, signal.Signals[self.recipe["stop_signal"]])
-        return self.process.wait(seconds(self.recipe["stop_grace_period"]))
+        return self.process.wait(seconds(self.recipe["stop_grace_period"]) if within_s is None else within_s)
 
 
 @contextmanager
