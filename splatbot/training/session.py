@@ -18,6 +18,7 @@ from splatbot.training.distributed import ALONE, TrainingGroup, check_same, nume
 from splatbot.training.folder import ProgressRow, TrainingFolder, TrainingSettings
 from splatbot.training.images import ImageCache, check_memory, pixels
 from splatbot.training.initialize import initial_model
+from splatbot.training.intrinsics import RefinedCamera, with_refined
 from splatbot.training.options import TrainingOptions
 from splatbot.training.scoring import HeldOutScore, score_held_out, summary
 from splatbot.training.trainer import Trainer
@@ -25,6 +26,9 @@ from splatbot.trajectory import Trajectory
 
 Pictures = Callable[[list[ProgressRow], list[HeldOutScore]], dict[str, bytes]]
 """Draws pictures of a training by file name: a function of a higher layer."""
+
+StepObserver = Callable[[float], None]
+"""Receives the loss of each step, after it. It may look at the session, and changes nothing that a step depends on."""
 
 
 @dataclass(frozen=True)
@@ -163,17 +167,25 @@ class TrainingSession:
         clock = self.seconds / (60 * self.options.minutes) if self.options.minutes else 0.0
         return min(1.0, max(done, clock))
 
+    @property
+    def remaining_s(self) -> float:
+        """Return the estimated rest of the run [s]; 0 before the first step."""
+        share = self.share
+        return self.seconds * (1 - share) / share if share > 0 else 0.0
+
     def run(
         self,
         *,
         report: Callable[[TrainingProgress], None] = lambda progress: None,
         stop: Callable[[], bool] = lambda: False,
+        observe: StepObserver = lambda loss: None,
     ) -> None:
         """Train, and save the checkpoint and the map; of a group, the first process saves, scores and reports.
 
         Args:
             report: receives the progress some times a second.
             stop: called before each iteration; training ends once it returns True, and can be resumed.
+            observe: called by the first process after each step; its time is not time of training.
 
         Raises:
             LostProcessError: another process of the group is gone.
@@ -181,10 +193,12 @@ class TrainingSession:
         saved = reported = time.monotonic()
         while not self._ended(stop()):
             began = time.perf_counter()
-            self._losses.append(self.trainer.step(self.share))
+            loss = self.trainer.step(self.share)
+            self._losses.append(loss)
             self.seconds += time.perf_counter() - began
             if not self.group.leads:
                 continue
+            observe(loss)
             if self.share >= (len(self.rows) + 1) / CONSTANTS.scored_times and self.share < 1.0:
                 report(self._progress("scoring"))
                 self._note(self._some_psnr())
@@ -210,9 +224,23 @@ class TrainingSession:
         self.folder.save_checkpoint(self._state())
 
     def save_map(self) -> None:
-        """Write the map and the poses of its images."""
-        poses = self.trainer.poses.poses()
-        self.folder.save_map(self.trainer.model, Trajectory(np.arange(float(len(poses))), poses))
+        """Write the map, the poses of its images, and their cameras and exposures if those were estimated."""
+        trainer = self.trainer
+        poses = trainer.poses.poses()
+        exposures = None
+        if trainer.exposures is not None:
+            names = [view.name for view in self.images.views]
+            exposures = dict(zip(names, trainer.exposures.transforms.tolist(), strict=True))
+        trajectory = Trajectory(np.arange(float(len(poses))), poses)
+        self.folder.save_map(trainer.model, trajectory, self._cameras(), exposures)
+
+    def _cameras(self) -> list[RefinedCamera]:
+        """Return the cameras with their intrinsics as refined so far; empty if they are not refined."""
+        return [] if self.trainer.intrinsics is None else self.trainer.intrinsics.cameras()
+
+    def _held_out_now(self) -> ImageCache:
+        """Return the held-out images with the intrinsics of their cameras as refined so far."""
+        return self.held_out.with_views(with_refined(self.held_out.views, self._cameras()))
 
     def score(
         self, pictures: Pictures = lambda rows, scores: {}, report: Callable[[TrainingProgress], None] = lambda _: None
@@ -220,7 +248,7 @@ class TrainingSession:
         """Score all held-out views; write the scores and the pictures; return the scores."""
         scores = score_held_out(
             self.trainer.model,
-            self.held_out,
+            self._held_out_now(),
             self.options,
             self.trainer.extent,
             shown=CONSTANTS.shown_views,
@@ -250,7 +278,7 @@ class TrainingSession:
             return None
         scores = score_held_out(
             self.trainer.model,
-            self.held_out,
+            self._held_out_now(),
             self.options,
             self.trainer.extent,
             every=self._scored_every,
@@ -269,6 +297,4 @@ class TrainingSession:
 
     def _progress(self, doing: str) -> TrainingProgress:
         psnr_db = next((row.psnr_db for row in reversed(self.rows) if row.psnr_db is not None), None)
-        share = self.share
-        remaining = self.seconds * (1 - share) / share if share > 0 else 0.0
-        return TrainingProgress(self._row(psnr_db), share, remaining, doing)
+        return TrainingProgress(self._row(psnr_db), self.share, self.remaining_s, doing)
