@@ -14,6 +14,8 @@ from typing import Any
 
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from splatbot.errors import InputError
+
 _NO_FILES = (errno.EMFILE, errno.ENFILE)
 _LOG_EVERY_S = 60.0
 _FREED = 16  # connections that are closed when no file descriptors are left
@@ -170,6 +172,27 @@ class Listener(socket.socket):
             os.close(self._accept()[0])  # type: ignore[attr-defined]
         finally:
             self._reserve = os.open(os.devnull, os.O_RDONLY)
+
+
+def listen(host: str, port: int, connections: Connections) -> Listener:
+    """Open a listening socket.
+
+    Raises:
+        InputError: the address cannot be listened on.
+    """
+    listener = Listener(connections, socket.AF_INET6 if ":" in host else socket.AF_INET)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind((host, port))
+        listener.listen(2048)  # now, so that early clients wait for the application instead of being refused
+    except OSError as error:
+        listener.close()
+        raise InputError(
+            f"cannot listen on {host} port {port} ({error.strerror}).",
+            field="port",
+            hint="give another --host or --port",
+        ) from error
+    return listener
 
 
 class HttpProtocol(H11Protocol):

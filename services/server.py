@@ -12,10 +12,9 @@ from types import FrameType
 import uvicorn
 from fastapi import FastAPI
 
-from splatbot.errors import InputError
 from splatbot.logs.ros_types import typestore
 from splatbot.services.app import create_app
-from splatbot.services.connections import Connections, HttpProtocol, Listener, raise_file_limit
+from splatbot.services.connections import Connections, HttpProtocol, listen, raise_file_limit
 from splatbot.services.heap import freeze_imports
 from splatbot.services.runtime import Runtime, check_exposure
 from splatbot.services.settings import ServiceSettings
@@ -119,24 +118,3 @@ def server_config(app: FastAPI, settings: ServiceSettings) -> uvicorn.Config:
         forwarded_allow_ips=list(settings.trusted_proxies),
         loop="asyncio",  # uvloop does not ask the listener
     )
-
-
-def listen(host: str, port: int, connections: Connections) -> Listener:
-    """Open a listening socket.
-
-    Raises:
-        InputError: the address cannot be listened on.
-    """
-    listener = Listener(connections, socket.AF_INET6 if ":" in host else socket.AF_INET)
-    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    try:
-        listener.bind((host, port))
-        listener.listen(2048)  # now, so that early clients wait for the application instead of being refused
-    except OSError as error:
-        listener.close()
-        raise InputError(
-            f"cannot listen on {host} port {port} ({error.strerror}).",
-            field="port",
-            hint="give another --host or --port",
-        ) from error
-    return listener

@@ -8,8 +8,7 @@ import socket
 import pytest
 
 from splatbot.errors import InputError
-from splatbot.services.connections import Connections
-from splatbot.services.server import listen
+from splatbot.services.connections import Connections, listen
 
 CONNECTIONS = Connections(8, 8, 10.0, 30.0)
 
