@@ -28,6 +28,12 @@ from splatbot.trajectory import Trajectory
 
 _POLL_S = 0.1
 _LEAST_MINUTES = 0.01
+_OF_ONE_BLOCK = {
+    "refine_poses": "refine poses",
+    "refine_intrinsics": "refine intrinsics",
+    "exposure": "compensate exposures",
+}
+"""Options that a training in blocks refuses."""
 
 
 class BlockTraining:
@@ -43,7 +49,7 @@ class BlockTraining:
         resume: continue with the blocks of the folder, if it has any.
 
     Raises:
-        InputError: the scene cannot be cut into these blocks, or the poses are to be refined.
+        InputError: the scene cannot be cut into these blocks, or an option estimates values of views.
     """
 
     def __init__(
@@ -55,9 +61,10 @@ class BlockTraining:
         start: GaussianModel | None = None,
         resume: bool = False,
     ) -> None:
-        if settings.options.refine_poses:
-            hint = "leave one out; the poses of a view would differ between its blocks"
-            raise InputError("cannot refine poses.", field="--blocks", hint=hint)
+        for name, problem in _OF_ONE_BLOCK.items():
+            if getattr(settings.options, name):
+                hint = "leave one out; the values of a view would differ between its blocks"
+                raise InputError(f"cannot {problem}.", field="--blocks", hint=hint)
         self.data = data
         self.folder = folder
         self.train, self.held_out = data.split(settings.held_out_every)

@@ -6,7 +6,7 @@ import io
 import json
 import pickle
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -14,12 +14,14 @@ from typing import Any
 import torch
 
 from splatbot.atomic import atomic_write, replace_files, sweep_drafts, write_bytes, write_text
-from splatbot.errors import FormatError, InputError
+from splatbot.camera import Camera
+from splatbot.errors import CameraError, FormatError, InputError
 from splatbot.formats.ply import save_ply
 from splatbot.gaussians import GaussianModel
 from splatbot.layouts import MAP_NAME, TRAINING_NAME
 from splatbot.results.metrics import without_nan
 from splatbot.training.blocks import Cut, SceneBlock
+from splatbot.training.intrinsics import RefinedCamera
 from splatbot.training.options import TrainingOptions
 from splatbot.trajectory import Trajectory
 
@@ -77,6 +79,8 @@ class TrainingFolder:
         self.checkpoint = self.path / "checkpoint.pt"
         self.map = self.path / MAP_NAME
         self.trajectory = self.path / "trajectory.tum"
+        self.cameras = self.path / "cameras.json"
+        self.exposures = self.path / "exposures.json"
         self.progress = self.path / "progress.jsonl"
         self.scores = self.path / "scores.json"
         self.start = self.path / "start.ply"  # of a block
@@ -92,7 +96,8 @@ class TrainingFolder:
             self.path.mkdir(parents=True, exist_ok=True)
             sweep_drafts(self.path)
             pictures = [self.path / name for name in _PICTURES]
-            for file in (self.scores, self.checkpoint, self.map, self.trajectory, self.progress, *pictures):
+            estimates = self.trajectory, self.cameras, self.exposures
+            for file in (self.scores, self.checkpoint, self.map, *estimates, self.progress, *pictures):
                 file.unlink(missing_ok=True)
             if self.blocks.exists():
                 shutil.rmtree(self.blocks)
@@ -159,13 +164,42 @@ class TrainingFolder:
             raise FormatError("is no checkpoint of a training.", file=self.checkpoint, hint=_HINT)
         return state
 
-    def save_map(self, model: GaussianModel, trajectory: Trajectory) -> None:
-        """Write the map and the poses of its images."""
-        writers = {
+    def save_map(
+        self,
+        model: GaussianModel,
+        trajectory: Trajectory,
+        cameras: Sequence[RefinedCamera] = (),
+        exposures: Mapping[str, Sequence[Sequence[float]]] | None = None,
+    ) -> None:
+        """Write the map, the poses of its images, refined cameras, and transforms (3, 4) of exposures by image."""
+        writers: dict[str, Callable[[Path], None]] = {
             self.map.name: lambda path: save_ply(model, path, bookkeeping=True),
             self.trajectory.name: trajectory.save,
         }
+        if cameras:
+            values = {"format": _FORMAT, "cameras": [asdict(camera) for camera in cameras]}
+            writers[self.cameras.name] = write_text(json.dumps(values, indent=2))
+        if exposures is not None:
+            writers[self.exposures.name] = write_text(json.dumps(dict(exposures), indent=2))
         replace_files(self.path, writers, remove=(self.scores.name,))
+
+    def load_cameras(self) -> list[RefinedCamera]:
+        """Read the refined cameras; empty if the training did not refine them.
+
+        Raises:
+            FormatError: the file is damaged.
+        """
+        if not self.cameras.exists():
+            return []
+        try:
+            rows = json.loads(self.cameras.read_text())["cameras"]
+            return [
+                RefinedCamera(str(row["name"]), Camera(**row["given"]), Camera(**row["refined"]), int(row["views"]))
+                for row in rows
+            ]
+        except (OSError, ValueError, KeyError, TypeError, CameraError) as error:
+            hint = f"write it again: splatbot train --resume {self.path}"
+            raise FormatError(f"is damaged ({error}).", file=self.cameras, field="cameras", hint=hint) from error
 
     def save_scores(
         self, rows: Sequence[ProgressRow], scores: Mapping[str, Any], pictures: Mapping[str, bytes]

@@ -72,6 +72,12 @@ class ImageCache:
         camera, reduce = self.views[index].camera, self._fitting(index, reduce)
         return camera if reduce == 1 else camera.resized(camera.width // reduce, camera.height // reduce)
 
+    def with_views(self, views: Sequence[TrainingView]) -> ImageCache:
+        """Return the same images, not read again, as those of ``views`` that differ in intrinsics alone."""
+        other = ImageCache(views)
+        other._kept = self._kept
+        return other
+
     def _fitting(self, index: int, reduce: int) -> int:
         """Return the largest reduction up to ``reduce`` that keeps an image large enough."""
         camera = self.views[index].camera

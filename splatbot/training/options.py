@@ -56,6 +56,8 @@ class TrainingOptions:
         opacity_weight, scale_weight: weights of the mean opacity and the mean σ [1/m]; None for 0.01 with "mcmc" and 0
             otherwise.
         refine_poses: estimate a correction of each camera pose.
+        refine_intrinsics: estimate fx, fy, cx and cy of each camera; its lens distortion is fixed.
+        exposure: estimate an affine colour transform of the map for each photograph.
         antialiased: render with opacities that compensate the low-pass filter (Yu et al. 2024).
         coarse_share: share of the run at half the resolution or less.
         seed: of all random draws.
@@ -74,6 +76,8 @@ class TrainingOptions:
     opacity_weight: float | None = None
     scale_weight: float | None = None
     refine_poses: bool = False
+    refine_intrinsics: bool = False
+    exposure: bool = False
     antialiased: bool = False
     coarse_share: float = 0.3
     seed: int = 0
@@ -114,7 +118,8 @@ class TrainingOptions:
     @property
     def keeps_frame(self) -> bool:
         """Return whether the trained map keeps surfaces and world frame of the start, so that it can replace it."""
-        return self.keep_surfaces and self.strategy == "fixed" and not self.refine_poses
+        refined = self.refine_poses or self.refine_intrinsics
+        return self.keep_surfaces and self.strategy == "fixed" and not refined
 
     def capped(self, pixels: int) -> TrainingOptions:
         """Return the options with ``max_gaussians`` for training views of ``pixels`` pixels in all."""

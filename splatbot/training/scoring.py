@@ -16,6 +16,7 @@ from splatbot.evaluation.image import psnr, ssim
 from splatbot.gaussians import GaussianModel
 from splatbot.optimize.losses import l1_dssim
 from splatbot.results.metrics import without_nan
+from splatbot.training.exposures import exposed, fitted_exposure
 from splatbot.training.images import ImageCache, Photo
 from splatbot.training.options import TrainingOptions
 from splatbot.training.poses import CameraPoses
@@ -34,12 +35,15 @@ class HeldOutScore:
         psnr_db: over the pixels that may be trained on [dB].
         ssim: over the whole image, 0 to 1, without pixels that may not be trained on; None if it was not wanted.
         images: (2, H, W, 3) uint8, the photograph and the map from its pose; None if they were not wanted.
+        corrected_psnr_db: PSNR after the affine colour transform of least squares between the map and the photograph
+            [dB]; None unless the training compensates exposures.
     """
 
     name: str
     psnr_db: float
     ssim: float | None = None
     images: NDArray[np.uint8] | None = None
+    corrected_psnr_db: float | None = None
 
 
 def score_held_out(
@@ -56,7 +60,8 @@ def score_held_out(
     """Render each view of ``images`` and compare it with the photograph; views without a counted pixel are left out.
 
     With refined poses the map is free to move as a whole. Each view's pose is then aligned to the map first (Lin et al.
-    2021, BARF).
+    2021, BARF). With compensated exposures, the map has the mean exposure of the training views. PSNR is that of the
+    map as it is, and a second PSNR that after the best affine colour transform of the view.
 
     Args:
         model: the map.
@@ -81,17 +86,23 @@ def score_held_out(
         if options.refine_poses:
             _align(model, photo, poses, index, background, options)
         with torch.no_grad():
-            render, _, _ = render_photo(
+            render, alpha, _ = render_photo(
                 model, photo, poses.viewmats[index], background, model.sh_degree, antialiased=options.antialiased
             )
-        image, render = photo.over(background), render[..., :3].clamp(0, 1).contiguous()
-        counted = slice(None) if photo.trained is None else photo.trained
+        image, colors = photo.over(background), render[..., :3]
+        render = colors.clamp(0, 1).contiguous()
+        counted = torch.ones(image.shape[:2], dtype=torch.bool) if photo.trained is None else photo.trained
+        corrected = None
+        if options.exposure:
+            transform = fitted_exposure(colors, alpha, background, image, counted)
+            corrected = exposed(colors, alpha, background, transform).clamp(0, 1)
         scores.append(
             HeldOutScore(
                 images.views[index].name,
                 psnr(render[counted].numpy(), image[counted].numpy()),
                 None if psnr_only else _ssim(render, image, photo),
                 (255 * torch.stack([image, render])).round().to(torch.uint8).numpy() if index in kept else None,
+                None if corrected is None else psnr(corrected[counted].numpy(), image[counted].numpy()),
             )
         )
     return scores
@@ -100,8 +111,14 @@ def score_held_out(
 def summary(scores: list[HeldOutScore]) -> dict[str, Any]:
     """Return the means and the single values of scores, for JSON; the means are None without views."""
     values = {"psnr_db": [s.psnr_db for s in scores], "ssim": [s.ssim or 0.0 for s in scores]}
+    corrected = [s.corrected_psnr_db for s in scores if s.corrected_psnr_db is not None]
+    if corrected:
+        values["corrected_psnr_db"] = corrected
     means = {name: round(fmean(of), 4) if of else None for name, of in values.items()}
-    views = [{"name": s.name, "psnr_db": round(s.psnr_db, 4), "ssim": round(s.ssim or 0.0, 4)} for s in scores]
+    views = [
+        {"name": score.name, **{name: round(of[index], 4) for name, of in values.items()}}
+        for index, score in enumerate(scores)
+    ]
     found: dict[str, Any] = without_nan({"held_out": len(scores), **means, "views": views})
     return found
 

@@ -23,11 +23,19 @@ from splatbot.rasterize import rasterization
 from splatbot.rasterize.meta import RenderMeta
 from splatbot.rasterize.native import one_torch_thread
 from splatbot.training.distributed import ALONE, TrainingGroup
+from splatbot.training.exposures import ExposureTransforms, exposed
 from splatbot.training.images import ImageCache, Photo
+from splatbot.training.intrinsics import CameraIntrinsics, matrix, prior
 from splatbot.training.options import TrainingOptions
 from splatbot.training.poses import CameraPoses
 
 _MAPPING = MappingConfig()
+_OF_VIEWS = {
+    "poses": ("viewmats", "first", "second", "steps"),
+    "intrinsics": ("changes", "first", "second", "steps"),
+    "exposures": ("transforms", "first", "second", "steps"),
+}
+"""Values of views that training can estimate, with the names of their state."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +47,8 @@ class TrainerConstants:
         quats_rate, scales_rate, opacities_rate, dc_rate: constant rates of the other parameters.
         rest_share: rate of the higher harmonics [share of ``dc_rate`` ].
         pose_rate: at the start and at the end [rad]; exponential in between.
+        intrinsics_rate: of relative changes, at the start and at the end; exponential in between.
+        exposure_rate: at the start and at the end; exponential in between (Kerbl et al. 2024).
         harmonics_share: share of the run after which the harmonics have their final degree.
         covered_alpha: depth counts where the map covers a pixel more.
     """
@@ -50,6 +60,8 @@ class TrainerConstants:
     dc_rate: float = 2.5e-3
     rest_share: float = 1 / 20
     pose_rate: tuple[float, float] = (2e-3, 2e-5)
+    intrinsics_rate: tuple[float, float] = (1e-3, 1e-5)
+    exposure_rate: tuple[float, float] = (1e-2, 1e-3)
     harmonics_share: float = 0.4
     covered_alpha: float = 0.5
 
@@ -64,7 +76,9 @@ class BatchGradients:
     Args:
         loss: (1,).
         grads: of the Gaussians' parameters by name.
-        poses: (B, 4, 4) of each view's T_camera_world, float64; None if the loss does not depend on them.
+        poses: (B, 4, 4) of each view's T_camera_world, float64; None if poses are not refined.
+        intrinsics: (B, 4) of the changes of each view's camera, float64; None if intrinsics are not refined.
+        exposures: (B, 3, 4) of each view's transform, float64; None if exposures are not compensated.
         seen: (B, N) uint8, 1 where a Gaussian is in view.
         centers: (B, N, 2) of the projected centres in an image of width and height 2; B is 0 if no strategy needs them.
     """
@@ -72,6 +86,8 @@ class BatchGradients:
     loss: Tensor
     grads: dict[str, Tensor]
     poses: Tensor | None
+    intrinsics: Tensor | None
+    exposures: Tensor | None
     seen: Tensor
     centers: Tensor
 
@@ -110,6 +126,8 @@ class Trainer:
         self.group = group
         self.iteration = 0
         self.poses = CameraPoses([view.T_world_camera for view in images.views], extent)
+        self.intrinsics = CameraIntrinsics(images.views) if options.refine_intrinsics else None
+        self.exposures = ExposureTransforms(len(images.views)) if options.exposure else None
         self.adam = GaussianAdam(dict.fromkeys(PARAMETERS, 0.0))
         self.adam.extend(self.model)
         self.strategy = options.make_strategy()
@@ -125,7 +143,7 @@ class Trainer:
             "model": dict(vars(self.model)),
             "adam": {"steps": steps, "first": first, "second": second, "skipped": self.adam.skipped},
             "strategy": dict(self._growth),
-            "poses": {name: getattr(self.poses, name) for name in ("viewmats", "first", "second", "steps")},
+            **{name: {field: getattr(part, field) for field in _OF_VIEWS[name]} for name, part in self._of_views()},
             "random": self._random.get_state(),
             "order": self._order,
         }
@@ -138,10 +156,16 @@ class Trainer:
         self.adam.restore((adam["steps"], adam["first"], adam["second"]))
         self.adam.skipped = adam["skipped"]
         self._growth = dict(state["strategy"])
-        for name, value in state["poses"].items():
-            setattr(self.poses, name, value)
+        for name, part in self._of_views():
+            for field in _OF_VIEWS[name]:
+                setattr(part, field, state[name][field])
         self._random.set_state(state["random"])
         self._order = state["order"]
+
+    def _of_views(self) -> list[tuple[str, Any]]:
+        """Return name and estimator of each kind of values of views that this training has."""
+        parts = [(name, getattr(self, name)) for name in _OF_VIEWS]
+        return [(name, part) for name, part in parts if part is not None]
 
     def step(self, progress: float) -> float:
         """Run one iteration and return its mean loss.
@@ -163,12 +187,17 @@ class Trainer:
         self.model = grow_harmonics(self.model, self.adam, degree)
         self._set_rates(progress)
         batch = self._gradients(views, reduce, degree)
+        indices = [index for index, _ in views]
         if batch.poses is not None:
-            for (index, _), gradient in zip(views, batch.poses, strict=True):
+            for index, gradient in zip(indices, batch.poses, strict=True):
                 self.poses.step(index, gradient, _between(CONSTANTS.pose_rate, progress))
+        if self.intrinsics is not None and batch.intrinsics is not None:
+            self.intrinsics.step(indices, batch.intrinsics, _between(CONSTANTS.intrinsics_rate, progress))
+        if self.exposures is not None and batch.exposures is not None:
+            self.exposures.step(indices, batch.exposures, _between(CONSTANTS.exposure_rate, progress))
         self._add_regularizers(batch.grads)
         seen = batch.seen.bool()
-        with self._surfaces_kept([index for index, _ in views], reduce, seen):
+        with self._surfaces_kept(indices, reduce, seen):
             self.adam.step(self.model, batch.grads, seen.any(0))
         done = StrategyStep(self.iteration, progress, batch.meta(), self.adam, self._random)
         self.model = self.strategy.step_post_backward(self.model, self._growth, done)
@@ -178,7 +207,10 @@ class Trainer:
         """Compute the gradients of the mean loss over views and their backgrounds, each process those of its share."""
         n, count = len(self.model), len(views)
         parameters = {name: getattr(self.model, name).requires_grad_(True) for name in PARAMETERS}
-        viewmats = self.poses.viewmats[[index for index, _ in views]].requires_grad_(self.options.refine_poses)
+        indices = [index for index, _ in views]
+        viewmats = self.poses.viewmats[indices].requires_grad_(self.options.refine_poses)
+        changes = None if self.intrinsics is None else self.intrinsics.of_views(indices).requires_grad_()
+        transforms = None if self.exposures is None else self.exposures.transforms[indices].requires_grad_()
         loss, seen = torch.zeros(1), torch.zeros(count, n, dtype=torch.uint8)
         centers = torch.zeros(count if self._growth else 0, n, 2)
         for row in self.group.share(count):
@@ -190,10 +222,14 @@ class Trainer:
                 viewmats[row],
                 background,
                 degree,
+                K=None if changes is None else matrix(self.images.views[index].camera, changes[row], photo.camera),
                 antialiased=self.options.antialiased,
                 absgrad=self.strategy.absgrad,
             )
-            own = self._loss(render, alpha, photo, background)
+            transform = None if transforms is None else transforms[row]
+            own = self._loss(render, alpha, photo, background, transform)
+            if changes is not None:
+                own = own + prior(changes[row]).float()
             self.strategy.step_pre_backward(self._growth, meta)
             own.backward()
             loss += own.detach()
@@ -206,11 +242,12 @@ class Trainer:
         for parameter in parameters.values():
             parameter.requires_grad_(False)
             parameter.grad = None
-        poses = viewmats.grad
-        self.group.sum(loss, *grads.values(), seen, centers, *(() if poses is None else (poses,)))
+        poses, intrinsics, exposures = (of.grad if of is not None else None for of in (viewmats, changes, transforms))
+        of_views = [grad for grad in (poses, intrinsics, exposures) if grad is not None]
+        self.group.sum(loss, *grads.values(), seen, centers, *of_views)
         for total in (loss, *grads.values()):
             total /= count
-        return BatchGradients(loss, grads, poses, seen, centers)
+        return BatchGradients(loss, grads, poses, intrinsics, exposures, seen, centers)
 
     @contextmanager
     def _surfaces_kept(self, views: list[int], reduce: int, seen: Tensor) -> Iterator[None]:
@@ -256,9 +293,17 @@ class Trainer:
             return torch.rand(3, generator=self._random)
         return self.options.shade
 
-    def _loss(self, render: Tensor, alpha: Tensor, photo: Photo, background: Tensor) -> Tensor:
-        """Compute L = (1 - λ) L1 + λ (1 - SSIM) + w_d mean |(D - D*) / D*|, over the pixels that are trained on."""
-        loss = l1_dssim(render[..., :3].contiguous(), photo.over(background), self.options.dssim_weight, photo.trained)
+    def _loss(
+        self, render: Tensor, alpha: Tensor, photo: Photo, background: Tensor, transform: Tensor | None
+    ) -> Tensor:
+        """Compute L = (1 - λ) L1 + λ (1 - SSIM) + w_d mean |(D - D*) / D*|, over the pixels that are trained on.
+
+        With a transform (3, 4), the colours are those of the photograph's exposure.
+        """
+        colors = render[..., :3]
+        if transform is not None:
+            colors = exposed(colors, alpha, background, transform)
+        loss = l1_dssim(colors.contiguous(), photo.over(background), self.options.dssim_weight, photo.trained)
         if photo.depth is None or self.options.depth_weight == 0:
             return loss
         depth = photo.depth[..., None]
@@ -285,6 +330,7 @@ def render_photo(
     background: Tensor,
     degree: int,
     *,
+    K: Tensor | None = None,
     antialiased: bool = False,
     absgrad: bool = False,
 ) -> tuple[Tensor, Tensor, RenderMeta]:
@@ -296,6 +342,7 @@ def render_photo(
         viewmat: (4, 4) T_camera_world.
         background: (3,) seen where the map is transparent.
         degree: of the harmonics in use.
+        K: (3, 3) intrinsics with pixel centres at +0.5; None for those of the photograph.
         antialiased: whether opacities compensate the low-pass filter.
         absgrad: whether the absolute gradients of the projected centres are needed.
     """
@@ -306,7 +353,7 @@ def render_photo(
         torch.sigmoid(model.opacity_logits),
         model.sh,
         viewmat[None],
-        torch.from_numpy(photo.camera.K_corner)[None],
+        (torch.from_numpy(photo.camera.K_corner) if K is None else K)[None],
         photo.camera.width,
         photo.camera.height,
         sh_degree=degree,

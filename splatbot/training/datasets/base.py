@@ -31,6 +31,7 @@ class TrainingView:
         read: returns the image (H, W, 3) RGB or (H, W, 4) RGBA with straight alpha, undistorted and scaled.
         read_depth: returns depth (H, W) [m], 0 without measurement; None if the dataset has no depth.
         read_mask: returns a mask (H, W), True where a pixel must not be trained on; None if all may be.
+        camera_name: of the camera in the dataset; empty if cameras have no names there.
     """
 
     name: str
@@ -39,6 +40,7 @@ class TrainingView:
     read: Callable[[], NDArray[np.uint8]]
     read_depth: Callable[[], NDArray[np.float32]] | None = None
     read_mask: Callable[[], NDArray[np.bool_]] | None = None
+    camera_name: str = ""
 
 
 @dataclass(frozen=True, eq=False)

@@ -36,7 +36,8 @@ def colmap_dataset(folder: Path, scale: int = 1) -> TrainingData:
     poses = [_pose(images, row) for row in rows]
     points, colors = read_points(points3d)
     photos = _photos(_image_root(model, scale), _image_lenses(images, rows, lenses), scale)
-    views = [photo.view(row.name, T) for row, photo, T in zip(rows, photos, poses, strict=True)]
+    named = zip(rows, photos, poses, strict=True)
+    views = [photo.view(row.name, T, f"camera {row.camera_id}") for row, photo, T in named]
     return TrainingData("colmap", folder, sorted_views(images, views), points, colors)
 
 

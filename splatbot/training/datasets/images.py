@@ -101,12 +101,11 @@ class PhotoFile:
     lens: Lens
     size: tuple[int, int]
 
-    def view(self, name: str, T_world_camera: NDArray[np.float64]) -> TrainingView:
-        """Return the photograph as a view with a pose (4, 4)."""
+    def view(self, name: str, T_world_camera: NDArray[np.float64], camera_name: str = "") -> TrainingView:
+        """Return the photograph as a view with a pose (4, 4) and the name of its camera."""
         camera = self.lens.pinhole.resized(*self.size)
-        return TrainingView(
-            name, camera, T_world_camera, self.read, read_mask=self.read_mask if self.lens.distorts else None
-        )
+        read_mask = self.read_mask if self.lens.distorts else None
+        return TrainingView(name, camera, T_world_camera, self.read, read_mask=read_mask, camera_name=camera_name)
 
     def read(self) -> Image:
         """Read the image (H, W, 3) RGB or (H, W, 4) RGBA of the pinhole camera.

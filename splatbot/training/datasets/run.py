@@ -85,9 +85,12 @@ class RunFrames:
     def view(self, index: int, T_world_camera: NDArray[np.float64]) -> TrainingView:
         """Return the view of frame ``index`` of the log, with its pose (4, 4)."""
         color, depth, mask = partial(self.color, index), partial(self.depth, index), partial(self.mask, index)
-        camera = self._camera or self._read(index).camera
+        camera, camera_name = self._camera, ""
+        if camera is None:
+            frame = self._read(index)
+            camera, camera_name = frame.camera, frame.camera_name
         camera = camera.resized(*scaled_size(camera, self._scale))
-        return TrainingView(_name(index), camera, T_world_camera, color, depth, mask)
+        return TrainingView(_name(index), camera, T_world_camera, color, depth, mask, camera_name)
 
     def color(self, index: int) -> NDArray[np.uint8]:
         """Read the colour image (H, W, 3) of a frame."""
