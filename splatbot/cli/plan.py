@@ -60,6 +60,7 @@ def plan(
     speed: float = 0.2,
     budget_ms: float = 500.0,
     seed: int = 0,
+    seen_from: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None,
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
 ) -> int:
     """Plan a path of an arm among the Gaussians of a map.
@@ -97,6 +98,8 @@ def plan(
             robot can.
         budget_ms: time budget of the planner [ms].
         seed: seed of the search.
+        seen_from: place of the camera of plan.png [m, base]; a map is sharp from where it was recorded. By default the
+            camera stands above the side of the base.
         out: folder to write to; by default runs/plan.
     """
     if [goal, goal_pose, grasp].count(None) != 2:
@@ -182,7 +185,8 @@ def plan(
     }
     writers = {name: write_text(text) for name, text in texts.items()}
     of_arm = (appearance(arm), arm.fk, arm.T_link_tcp)
-    picture = plan_png(model, found.planner.arm, trajectory, *of_arm, nearest=nearest)
+    eye = None if seen_from is None else np.array(seen_from)
+    picture = plan_png(model, found.planner.arm, trajectory, *of_arm, nearest=nearest, seen_from=eye)
     replace_files(folder, writers | {"plan.png": write_bytes(picture)})
     (folder / "refused.png").unlink(missing_ok=True)  # of an earlier plan
     _print(result, trajectory, covers, nearest, folder)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
+from itertools import product
 
 import numpy as np
 import torch
@@ -11,6 +13,7 @@ from numpy.typing import NDArray
 
 from splatbot.camera import Camera
 from splatbot.collision import GaussianCollisionField, RobotSpheres
+from splatbot.errors import InputError
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import inverse, look_at, transform_points
 from splatbot.planning import JointTrajectory
@@ -20,7 +23,7 @@ from splatbot.protocols import Array
 from splatbot.rasterize.views import to_png
 from splatbot.report.annotations import Color, with_legend, with_ring, with_scale
 from splatbot.report.moving_page import MAP_IN_COLORS, bytes_of, evenly_spaced, moving_page, packed
-from splatbot.report.robot_drawing import DrawnPart, draw_robot, map_view
+from splatbot.report.robot_drawing import DrawnPart, draw_robot, map_view, sphere_parts
 from splatbot.report.sphere_gaussians import sphere_gaussians
 
 
@@ -32,21 +35,27 @@ class PlanPageConstants:
         max_points: largest number of points of the map that are shown.
         crop_radius: [m] radius of the map around the base that is shown.
         frames: postures of the animation.
-        ghosts: postures in the image.
         shown_solids: [m] radius around a collision in which obstacles beyond the map are drawn.
+        filled: share of the image that the motion fills, seen from a given place.
+        around_tool: [m] half edge of the cubes around the path of the tool that are shown then.
+        end_opacity: 0..1, of the arm at the start and at the goal.
+        shell_opacity: 0..1, of the certified spheres around the arm.
     """
 
     max_points: int = 40_000
     crop_radius: float = 1.6
     frames: int = 80
-    ghosts: int = 5
     shown_solids: float = 0.3
+    filled: float = 0.92
+    around_tool: float = 0.15
+    end_opacity: float = 0.4
+    shell_opacity: float = 0.35
 
 
 CONSTANTS = PlanPageConstants()
 
 
-_START, _END = np.array([0.15, 0.45, 0.9]), np.array([0.95, 0.5, 0.1])  # tints of the ends
+_START, _END = (0.15, 0.45, 0.9), (0.95, 0.5, 0.1)  # tints of the ends
 _START_SHADE, _END_SHADE = (0.49, 0.67, 0.94), (0.97, 0.7, 0.46)  # as the shaded arms look
 _FROM = np.array([-1.3, 1.3, 1.0])  # direction from the middle of the motion to the camera, in the base frame
 _PAGE_LEGEND = (
@@ -54,6 +63,7 @@ _PAGE_LEGEND = (
     ("arm, or its certified spheres", "linear-gradient(90deg, #b9bcc4, #5d6066)"),
     ("path of the tool", "rgb(240, 120, 30)"),
 )
+_SHELL = (0.45, 0.9, 0.4)
 _NEAREST, _TOOL, _SOLID = (1.0, 0.15, 0.2), (0.2, 0.9, 0.95), (0.65, 0.3, 0.95)
 
 
@@ -123,11 +133,13 @@ def plan_png(
     T_link_tcp: Array,
     *,
     nearest: ClosestApproach | None = None,
-    width: int = 960,
+    seen_from: Array | None = None,
+    width: int = 1280,
 ) -> bytes:
-    """Render the map with the arm at the start (blue), at the end (orange) and in between (transparent).
+    """Render the map with the arm where it is nearest to the map, and transparent at the start and at the goal.
 
-    The camera shows the whole motion. Dots show the path of the tool, and a ring the nearest point of the map.
+    The camera shows the whole motion. Dots show the path of the tool, and a ring the nearest point of the map. A green
+    shell encloses the nearest link: its certified spheres, larger by the margin. It does not touch the map.
 
     Args:
         model: the map.
@@ -137,39 +149,35 @@ def plan_png(
         fk: returns the poses T_base_link (K, L, 4, 4) of its links at joint positions (K, J).
         T_link_tcp: (4, 4) pose of the tool on the last link [m].
         nearest: the moment at which the arm is nearest to the map. If None, it is not drawn.
+        seen_from: (3,) place of the camera [m, base]. If None, it is above the side of the base.
         width: of the image [px]; the height is 3/4 of it.
+
+    Raises:
+        InputError: the camera is within the motion.
     """
-    times = np.linspace(0.0, trajectory.duration, CONSTANTS.ghosts)
     near = _within(model, inverse(arm.T_world_base))
     moments = trajectory.at(np.linspace(0.0, trajectory.duration, CONSTANTS.frames)).position
-    camera, T_world_camera, away = _framed(arm, moments, width)
     tool = (arm.T_world_base @ fk(moments)[:, -1] @ T_link_tcp)[:, :3, 3]
+    camera, T_world_camera, away = (
+        _framed(arm, moments, width) if seen_from is None else framed_from(seen_from, arm, moments, tool, width)
+    )
     drawn = [model.select(torch.from_numpy(near)), _dots(tool, 0.004, _TOOL)]
-    legend = [
-        ("arm at the start", _START_SHADE),
-        ("arm at the goal; transparent: in between", _END_SHADE),
-        ("path of the tool", _TOOL),
-    ]
+    view, depth = map_view(GaussianModel.concatenate(drawn), camera, T_world_camera)
+    time = trajectory.duration / 2 if nearest is None else nearest.time
+    start, shown, goal = arm.T_world_base @ fk(trajectory.at(np.array([0.0, time, trajectory.duration])).position)
+    draw = partial(draw_robot, view, depth, camera, T_world_camera)
+    draw(parts, shown)
+    draw(parts, start, tint=_START, opacity=CONSTANTS.end_opacity)
+    draw(parts, goal, tint=_END, opacity=CONSTANTS.end_opacity)
+    legend = [("arm at the start", _START_SHADE), ("arm at the goal", _END_SHADE), ("path of the tool", _TOOL)]
     if nearest is not None:
+        draw(sphere_parts(arm.spheres, nearest.link, arm.margin, _SHELL), shown, opacity=CONSTANTS.shell_opacity)
+        view = _ringed(view, camera, T_world_camera, nearest.point)
         least = f"ring: nearest to the map, {1e3 * nearest.clearance:.1f} mm beyond the margin"
         legend.append((f"{least}, at {nearest.time:.1f} s", _NEAREST))
-    view, depth = map_view(GaussianModel.concatenate(drawn), camera, T_world_camera)
-    links = arm.T_world_base @ fk(trajectory.at(times).position)
-    last = CONSTANTS.ghosts - 1
-    for k in (0, last, *range(1, last)):  # the ends first, because they hide and are hidden
-        share = k / last
-        draw_robot(
-            view,
-            depth,
-            camera,
-            T_world_camera,
-            parts,
-            links[k],
-            tint=(1 - share) * _START + share * _END,
-            opacity=1.0 if k in (0, last) else 0.3,
+        legend.append(
+            (f"shell: certified spheres of the nearest link, and {1e3 * arm.margin:.1f} mm of margin", _SHELL)
         )
-    if nearest is not None:
-        view = _ringed(view, camera, T_world_camera, nearest.point)
     view = with_legend(view, legend)
     return to_png(with_scale(view, camera, away, "at the middle of the picture"), "rgb")
 
@@ -224,6 +232,40 @@ def _framed(arm: RobotSpheres, q: Array, width: int) -> tuple[Camera, Array, flo
     radius = float(np.linalg.norm(points - middle, axis=1).max())
     away = float(radius / np.sin(np.arctan2(camera.height / 2, camera.fy)) + 1e-6)
     return camera, arm.T_world_base @ look_at(middle + away * _FROM / np.linalg.norm(_FROM), middle), away
+
+
+def framed_from(seen_from: Array, arm: RobotSpheres, q: Array, tool: Array, width: int) -> tuple[Camera, Array, float]:
+    """Return a camera at a given place that shows the arm and 15 cm around the path of its tool.
+
+    Args:
+        seen_from: (3,) place of the camera [m, base].
+        arm: collision spheres of the robot.
+        q: (K, J) configurations of the motion.
+        tool: (K, 3) path of the tool [m, world].
+        width: of the image [px].
+
+    Returns:
+        The camera, its pose (4, 4) in the world, and its distance from the middle of the motion [m].
+
+    Raises:
+        InputError: the place is within the motion.
+    """
+    height = width * 3 // 4
+    cube = CONSTANTS.around_tool * np.array(list(product((-1, 1), repeat=3)))
+    around = (tool[:, None] + cube).reshape(-1, 3)
+    points = transform_points(inverse(arm.T_world_base), np.concatenate([arm.centers(q).reshape(-1, 3), around]))
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    T_base_camera = look_at(seen_from, middle)
+    x, y, z = transform_points(inverse(T_base_camera), points).T
+    if not z.min() > 0.0:
+        place = ", ".join(f"{value:g}" for value in seen_from)
+        raise InputError(f"is ({place}), within the motion.", field="seen_from", hint="give a place farther away [m]")
+    rays = np.stack([x / z, y / z])
+    low, high = rays.min(axis=1), rays.max(axis=1)
+    focal = float(CONSTANTS.filled * (np.array([width, height]) / (high - low)).min())
+    cx, cy = (np.array([width - 1, height - 1]) - focal * (low + high)) / 2
+    camera = Camera(focal, focal, float(cx), float(cy), width, height)
+    return camera, arm.T_world_base @ T_base_camera, float(np.linalg.norm(seen_from - middle))
 
 
 def _ringed(view: NDArray[np.float32], camera: Camera, T_world_camera: Array, point: Array) -> NDArray[np.float32]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from splatbot.camera import Camera
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import transform_points
-from splatbot.protocols import Array
+from splatbot.protocols import Array, LinkSpheres
 from splatbot.rasterize.views import CONSTANTS as VIEWS
 from splatbot.rasterize.views import render_rgbd
 from splatbot.report.annotations import Color
@@ -26,11 +26,13 @@ class RobotDrawingConstants:
         samples: rays along each axis of a pixel; more make smoother edges.
         ambient: share of light that comes from all directions.
         tint: share of the tint in the colour of a part.
+        sphere_resolution: rings of triangles of a drawn sphere.
     """
 
     samples: int = 2
     ambient: float = 0.4
     tint: float = 0.55
+    sphere_resolution: int = 16
 
 
 CONSTANTS = RobotDrawingConstants()
@@ -46,6 +48,17 @@ class DrawnPart:
     link: int
     triangles: Array
     color: Color
+
+
+def sphere_parts(spheres: LinkSpheres, link: int, margin: float, color: Color) -> list[DrawnPart]:
+    """Return the spheres of a link as parts to draw, each with a radius larger by ``margin`` [m]."""
+    ball = o3d.geometry.TriangleMesh.create_sphere(resolution=CONSTANTS.sphere_resolution)
+    triangles = np.asarray(ball.vertices)[np.asarray(ball.triangles)]
+    own = spheres.link == link
+    return [
+        DrawnPart(link, center + (radius + margin) * triangles, color)
+        for center, radius in zip(spheres.centers[own], spheres.radii[own], strict=True)
+    ]
 
 
 def map_view(

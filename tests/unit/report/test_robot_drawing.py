@@ -9,8 +9,8 @@ import pytest
 
 from splatbot.camera import Camera
 from splatbot.geometry import look_at, transform_points
-from splatbot.protocols import Array
-from splatbot.report.robot_drawing import CONSTANTS, DrawnPart, draw_robot
+from splatbot.protocols import Array, LinkSpheres
+from splatbot.report.robot_drawing import CONSTANTS, DrawnPart, draw_robot, sphere_parts
 from splatbot.robots.appearance import appearance
 from splatbot.robots.arms import ARMS
 from splatbot.robots.store import load_robot
@@ -116,3 +116,19 @@ def test_another_arm_with_the_name_of_a_panda_is_not_drawn_as_one() -> None:
     robot = load_robot("ur5e")
     assert len(appearance(replace(robot, name="panda"))) == len(appearance(robot))
     assert len(appearance(replace(robot, name="panda-lab"))) == len(appearance(robot))
+
+
+def test_a_sphere_of_a_link_with_a_margin_has_the_silhouette_of_the_larger_sphere() -> None:
+    spheres = LinkSpheres(
+        np.array([0, 1], np.int32), np.array([[0.0, 0.0, 5.0], [0.0, 0.0, 0.0]]), np.array([9.0, 0.17])
+    )
+    (part,) = sphere_parts(spheres, 1, 0.03, (1.0, 1.0, 1.0))
+    assert part.link == 1
+    reach = np.linalg.norm(part.triangles, axis=-1)
+    np.testing.assert_allclose(reach, RADIUS, atol=1e-9)
+    view, depth = blank()
+    draw_robot(view, depth, CAMERA, T_CAMERA, [part], np.stack([np.eye(4)] * 2), opacity=0.5)
+    inside = np.isfinite(ball_depth())
+    covered = view.max(axis=2) > 0
+    assert (covered ^ inside).sum() < 0.06 * inside.sum()  # pixels at the edge, and flat triangles
+    assert depth.max() == 0.0  # a transparent shell hides nothing
