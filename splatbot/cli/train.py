@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 _DEFAULT_ITERATIONS = 7_000
 _WIDE_COLUMNS = 110  # of a terminal that shows all numbers
+_MOST_CAMERAS = 4  # of a summary
 _OF_A_RUN = "training"  # folder of a training within its run
 _PATIENCE_S = 5.0  # of a second Ctrl-C with a step that other processes still compute
 
@@ -44,6 +45,8 @@ def train(
     log: Annotated[str | None, tyro.conf.arg(metavar="LOG")] = None,
     background: Literal["auto", "black", "white", "random"] = "auto",
     refine_poses: bool = False,
+    refine_intrinsics: bool = False,
+    exposure: bool = False,
     antialiased: bool = False,
     batch: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
     processes: Annotated[int, tyro.conf.arg(metavar="N")] = 1,
@@ -69,7 +72,7 @@ def train(
         splatbot train scenes/garden --minutes 10 --scale 4
         splatbot train scenes/lego --iterations 20000 --out runs/lego
         splatbot train scenes/fox --strategy mcmc --max-gaussians 100000
-        splatbot train scenes/phone --refine-poses
+        splatbot train scenes/phone --refine-poses --exposure
         splatbot train runs/desk --minutes 5
         splatbot train scenes/garden --processes 4
         splatbot train scenes/town --blocks 8 --processes 2
@@ -91,6 +94,10 @@ def train(
         log: where the recording of a run is now, if it was moved.
         background: behind photographs with alpha; auto is white for Blender scenes and black otherwise.
         refine_poses: correct the camera poses; held-out views are aligned to the map before they are scored.
+        refine_intrinsics: correct focal lengths and principal point of each camera, and write cameras.json; lens
+            distortion is fixed.
+        exposure: compensate the exposure of each photograph by an affine colour transform, and write exposures.json.
+            Held-out views are scored as the map is, and with colours corrected.
         antialiased: compensate the low-pass filter in opacities, for views from other distances than the photographs'.
         batch: photographs of each step; one for each process by default.
         processes: number of processes that train together; each takes its share of the photographs of a step. For
@@ -135,6 +142,8 @@ def train(
             max_gaussians=max_gaussians,
             sh_degree=sh_degree,
             refine_poses=refine_poses,
+            refine_intrinsics=refine_intrinsics,
+            exposure=exposure,
             antialiased=antialiased,
             seed=seed,
             batch=batch if batch is not None else group.size if blocks == 1 else 1,
@@ -337,6 +346,7 @@ def _print(folder: TrainingFolder, map_: Path, scores: dict[str, Any]) -> None:
     from splatbot.cli.tables import print_table
     from splatbot.results.units import count, decibels, number
 
+    corrected = "corrected_psnr_db"
     pictures = [folder.path / name for name in ("held_out.jpg", "course.png")]
     rows = [
         ("iterations", count(scores["iterations"])),
@@ -344,8 +354,23 @@ def _print(folder: TrainingFolder, map_: Path, scores: dict[str, Any]) -> None:
         ("Gaussians", f"{count(scores['gaussians'])}, SH degree {scores['sh_degree']}"),
         ("held-out views", str(scores["held_out"])),
         ("PSNR", decibels(scores["psnr_db"])),
+        *((("colour-corrected PSNR", decibels(scores[corrected])),) if corrected in scores else ()),
         ("SSIM", number(scores["ssim"], 3)),
+        *_camera_rows(folder),
         ("map", str(map_)),
         *(("picture", str(path)) for path in pictures if path.exists()),
     ]
     print_table(rows, title=str(folder.path))
+
+
+def _camera_rows(folder: TrainingFolder) -> list[tuple[str, str]]:
+    """Return the first refined cameras with their intrinsics before and after; empty if none were refined."""
+    cameras = folder.load_cameras()
+    rows = []
+    for index, camera in enumerate(cameras[:_MOST_CAMERAS]):
+        given, refined = vars(camera.given), vars(camera.refined)
+        values = (f"{name} {given[name]:.2f} → {refined[name]:.2f}" for name in ("fx", "fy", "cx", "cy"))
+        rows.append((camera.name or f"camera {index + 1}", f"{', '.join(values)} px"))
+    if len(cameras) > len(rows):
+        rows.append(("more cameras", f"{len(cameras) - len(rows)}, in {folder.cameras}"))
+    return rows

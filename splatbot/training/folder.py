@@ -14,7 +14,6 @@ from typing import Any
 import torch
 
 from splatbot.atomic import atomic_write, replace_files, sweep_drafts, write_bytes, write_text
-from splatbot.camera import Camera
 from splatbot.errors import CameraError, FormatError, InputError
 from splatbot.formats.ply import save_ply
 from splatbot.gaussians import GaussianModel
@@ -177,7 +176,7 @@ class TrainingFolder:
             self.trajectory.name: trajectory.save,
         }
         if cameras:
-            values = {"format": _FORMAT, "cameras": [asdict(camera) for camera in cameras]}
+            values = {"format": _FORMAT, "cameras": [camera.to_json() for camera in cameras]}
             writers[self.cameras.name] = write_text(json.dumps(values, indent=2))
         if exposures is not None:
             writers[self.exposures.name] = write_text(json.dumps(dict(exposures), indent=2))
@@ -193,10 +192,7 @@ class TrainingFolder:
             return []
         try:
             rows = json.loads(self.cameras.read_text())["cameras"]
-            return [
-                RefinedCamera(str(row["name"]), Camera(**row["given"]), Camera(**row["refined"]), int(row["views"]))
-                for row in rows
-            ]
+            return [RefinedCamera.from_json(row) for row in rows]
         except (OSError, ValueError, KeyError, TypeError, CameraError) as error:
             hint = f"write it again: splatbot train --resume {self.path}"
             raise FormatError(f"is damaged ({error}).", file=self.cameras, field="cameras", hint=hint) from error

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,6 +18,7 @@ SIGMA = 0.05
 """Standard deviation of the prior of each relative change."""
 
 _PRIOR_WEIGHT = 1e-3
+_VALUES = ("fx", "fy", "cx", "cy", "width", "height")
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,22 @@ class RefinedCamera:
     given: Camera
     refined: Camera
     views: int
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the values of the camera by name; principal points count pixel centres at integers."""
+        cameras = {"given": self.given, "refined": self.refined}
+        values = {key: {name: getattr(camera, name) for name in _VALUES} for key, camera in cameras.items()}
+        return {"name": self.name, "views": self.views, **values}
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> RefinedCamera:
+        """Read the values of :meth:`to_json`.
+
+        Raises:
+            KeyError, TypeError, CameraError: a value is missing, or no intrinsic of a camera.
+        """
+        given, refined = (Camera(**values[key]) for key in ("given", "refined"))
+        return cls(str(values["name"]), given, refined, int(values["views"]))
 
 
 class CameraIntrinsics:

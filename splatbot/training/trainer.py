@@ -60,7 +60,7 @@ class TrainerConstants:
     dc_rate: float = 2.5e-3
     rest_share: float = 1 / 20
     pose_rate: tuple[float, float] = (2e-3, 2e-5)
-    intrinsics_rate: tuple[float, float] = (1e-3, 1e-5)
+    intrinsics_rate: tuple[float, float] = (2e-3, 2e-5)
     exposure_rate: tuple[float, float] = (1e-2, 1e-3)
     harmonics_share: float = 0.4
     covered_alpha: float = 0.5

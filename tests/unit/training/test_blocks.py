@@ -192,6 +192,8 @@ def test_the_settings_of_a_block_are_read_as_they_were_written(tmp_path: Path) -
         (("--blocks", "0"), "--blocks"),
         (("--blocks", "300", "--max-gaussians", "150"), "give 1 to 150"),
         (("--blocks", "2", "--refine-poses"), "refine poses"),
+        (("--blocks", "2", "--refine-intrinsics"), "refine intrinsics"),
+        (("--blocks", "2", "--exposure"), "compensate exposures"),
     ],
 )
 def test_blocks_that_are_not_possible_are_named_with_a_fix(

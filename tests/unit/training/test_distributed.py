@@ -37,7 +37,7 @@ from tests.unit.training.rendered import rendered_data, write_blender_scene
 from tests.waiting import until
 
 OPTIONS: tuple[dict[str, Any], ...] = (
-    {"strategy": "default", "refine_poses": True},
+    {"strategy": "default", "refine_poses": True, "refine_intrinsics": True, "exposure": True},
     {"strategy": "absgrad", "background": "random"},
     {"strategy": "mcmc", "background": "random"},
     {"strategy": "fixed", "keep_surfaces": True},
@@ -73,9 +73,17 @@ def second_process(report: str) -> None:
 
 
 def digest(trainer: Trainer) -> str:
-    """Return a digest of all parameters and poses."""
-    tensors = [getattr(trainer.model, name) for name in PARAMETERS]
-    return sha256(b"".join(tensor.numpy().tobytes() for tensor in (*tensors, trainer.poses.viewmats))).hexdigest()
+    """Return a digest of all parameters, poses, intrinsics and exposures."""
+    tensors = [getattr(trainer.model, name) for name in PARAMETERS] + of_views(trainer)
+    return sha256(b"".join(tensor.numpy().tobytes() for tensor in tensors)).hexdigest()
+
+
+def of_views(trainer: Trainer) -> list[torch.Tensor]:
+    """Return the estimated values of the views: poses, intrinsics and exposures, as far as there are any."""
+    tensors = [trainer.poses.viewmats]
+    tensors += [] if trainer.intrinsics is None else [trainer.intrinsics.changes]
+    tensors += [] if trainer.exposures is None else [trainer.exposures.transforms]
+    return tensors
 
 
 def session_of(folder: Path, group: TrainingGroup = ALONE, seed: int = 0) -> TrainingSession:
@@ -119,7 +127,8 @@ def test_two_processes_take_the_steps_of_one_that_sees_both_views(
         assert len(one.model) == len(two.model)
         for name in PARAMETERS:
             torch.testing.assert_close(getattr(two.model, name), getattr(one.model, name), rtol=0, atol=1e-6)
-        torch.testing.assert_close(two.poses.viewmats, one.poses.viewmats, rtol=0, atol=1e-6)
+        for in_two, in_one in zip(of_views(two), of_views(one), strict=True):
+            torch.testing.assert_close(in_two, in_one, rtol=0, atol=1e-6)
     assert len(found[0].model) > 200  # it grew
     alone = session_of(tmp_path / "alone")
     alone.run()

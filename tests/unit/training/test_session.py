@@ -85,6 +85,31 @@ def test_other_images_than_at_the_start_are_refused_and_a_missing_checkpoint_beg
         session_of(tmp_path, data, every=0, resume=True)
 
 
+def test_a_resumed_training_ends_with_the_cameras_exposures_and_scores_of_one_that_was_not_stopped(
+    data: TrainingData, tmp_path: Path
+) -> None:
+    options = {"refine_intrinsics": True, "exposure": True}
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    session = session_of(whole, data, **options)
+    session.run()
+    scores = session.score()
+    stopped = session_of(cut, data, **options)
+    stopped.run(stop=lambda: stopped.trainer.iteration == 17)
+    resumed = session_of(cut, data, resume=True, **options)
+    assert resumed.trainer.iteration == 17
+    resumed.run()
+    assert resumed.score() | {"seconds": 0.0} == scores | {"seconds": 0.0}
+    assert scores["corrected_psnr_db"] >= scores["psnr_db"]
+    for name in ("map.ply", "cameras.json", "exposures.json"):
+        assert (cut / name).read_bytes() == (whole / name).read_bytes()
+    (camera,) = TrainingFolder(cut).load_cameras()
+    assert (camera.given, camera.views) == (CAMERA, 5)
+    assert camera.refined != CAMERA
+    transforms = json.loads((cut / "exposures.json").read_text())
+    assert list(transforms) == [view.name for view in data.views[1:]]
+    np.testing.assert_allclose(np.mean(list(transforms.values()), axis=0), np.eye(3, 4), atol=1e-12)
+
+
 def test_images_beyond_the_free_memory_are_refused_with_a_scale_that_fits() -> None:
     def never() -> Any:
         raise AssertionError

@@ -70,6 +70,7 @@ def test_poses_intrinsics_and_points_of_a_real_scene_are_those_of_pycolmap(
         expected = np.vstack([image.cam_from_world().inverse().matrix(), [0, 0, 0, 1]])
         np.testing.assert_allclose(view.T_world_camera, expected, atol=1e-12)
         np.testing.assert_allclose(view.camera.K_corner, camera.calibration_matrix())
+        assert view.camera_name == f"camera {image.camera_id}"
         assert (view.camera.width, view.camera.height) == (camera.width, camera.height)
     points = sorted((*point.xyz, *point.color) for point in oracle.points3D.values())
     ours = sorted((*xyz, *rgb) for xyz, rgb in zip(data.points, data.point_colors, strict=True))
