@@ -20,10 +20,11 @@ from splatbot.layouts import MAP_NAME
 if TYPE_CHECKING:
     from splatbot.gaussians import GaussianModel
     from splatbot.results.folder import RunFolder
+    from splatbot.services.live_training.server import LivePage
     from splatbot.training.datasets import TrainingData
     from splatbot.training.distributed import TrainingGroup
     from splatbot.training.folder import TrainingFolder, TrainingSettings
-    from splatbot.training.session import TrainingProgress
+    from splatbot.training.session import StepObserver, TrainingProgress, TrainingSession
 
 _DEFAULT_ITERATIONS = 7_000
 _WIDE_COLUMNS = 110  # of a terminal that shows all numbers
@@ -56,6 +57,7 @@ def train(
     checkpoint_every: Annotated[float, tyro.conf.arg(metavar="S")] = 60.0,
     resume: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
     overwrite: bool = False,
+    viewer: Annotated[tuple[int, ...] | None, tyro.conf.arg(metavar="[PORT]")] = None,
     quiet: bool = False,
 ) -> int:
     """Train a map of Gaussians from posed photographs, or improve the map of a run.
@@ -97,7 +99,7 @@ def train(
         refine_intrinsics: correct focal lengths and principal point of each camera, and write cameras.json; lens
             distortion is fixed.
         exposure: compensate the exposure of each photograph by an affine colour transform, and write exposures.json.
-            Held-out views are scored as the map is, and with colours corrected.
+            The colour-corrected PSNR does not depend on the exposures of held-out views.
         antialiased: compensate the low-pass filter in opacities, for views from other distances than the photographs'.
         batch: photographs of each step; one for each process by default.
         processes: number of processes that train together; each takes its share of the photographs of a step. For
@@ -110,6 +112,8 @@ def train(
         resume: continue this training; all other options but processes are its own. Give DATASET only if it was
             moved.
         overwrite: replace the training that --out holds.
+        viewer: show the training on a page of this machine, at most 5 % of the time; the port is 8081 by default, and 0
+            takes a free one. Give it after DATASET.
         quiet: no progress and no summary, only errors.
     """
     if dataset is None and resume is None:
@@ -117,6 +121,7 @@ def train(
     if not checkpoint_every > 0:
         raise InputError(f"is {checkpoint_every:g}.", field="--checkpoint-every", hint="give seconds above 0")
     check_output(out)
+    port = _viewer_port(viewer)
 
     from splatbot.cli.datasets import open_training_data
     from splatbot.training.distributed import planned_group
@@ -156,11 +161,13 @@ def train(
     if settings.blocks != 1:
         if group.size != processes:
             raise InputError("is for one machine.", field="--blocks", hint="leave torchrun out")
+        if port is not None:
+            raise InputError("shows one training, not its blocks.", field="--viewer", hint="leave it or --blocks out")
         return _train_blocks(
             data, folder, settings, processes, checkpoint_every, log, resumed=resume is not None, quiet=quiet
         )
     quiet = quiet or not group.leads
-    return _train(data, folder, settings, group, checkpoint_every, log, resumed=resume is not None, quiet=quiet)
+    return _train(data, folder, settings, group, checkpoint_every, log, port, resumed=resume is not None, quiet=quiet)
 
 
 def _train(
@@ -170,6 +177,7 @@ def _train(
     group: TrainingGroup,
     checkpoint_every: float,
     log: str | None,
+    port: int | None,
     *,
     resumed: bool,
     quiet: bool,
@@ -187,7 +195,7 @@ def _train(
         if len(signals) > 1 and waited_s > _PATIENCE_S:
             raise KeyboardInterrupt
 
-    with Interrupts() as interrupts, _progress(quiet) as report:
+    with Interrupts() as interrupts, _page(port if group.leads else None) as page, _progress(quiet) as report:
         interrupts.when_requested = lambda: signals.append(None)
         with _resumable(folder, lambda: begun), ExitStack() as processes:
             with interrupts.interruptible():
@@ -199,7 +207,8 @@ def _train(
                 if not resumed and group.leads:
                     folder.begin(settings)
                     begun = True
-            session.run(report=report, stop=lambda: interrupts.requested is not None)
+            with _shown(session, page, folder.path.name, quiet=quiet) as observe:
+                session.run(report=report, stop=lambda: interrupts.requested is not None, observe=observe)
         if not group.leads:
             return 0
         if in_place:
@@ -211,6 +220,49 @@ def _train(
     if not quiet:
         _print(folder, data.folder / MAP_NAME if in_place else folder.map, scores)
     return 0 if scores["complete"] else _interrupted(folder, interrupts.requested)
+
+
+def _viewer_port(given: tuple[int, ...] | None) -> int | None:
+    """Return the port of --viewer [PORT]; None without the option."""
+    if given is None:
+        return None
+    from splatbot.services.live_training.server import DEFAULT_PORT
+
+    if len(given) > 1 or not all(0 <= port <= 65535 for port in given):
+        raise InputError(f"is {' '.join(map(str, given))}.", field="--viewer", hint="give one port from 0 to 65535")
+    return given[0] if given else DEFAULT_PORT
+
+
+@contextmanager
+def _page(port: int | None) -> Iterator[LivePage | None]:
+    """Yield the page of --viewer, which is served during the block, and print its address; None without a port."""
+    if port is None:
+        yield None
+        return
+    from splatbot.services.live_training.server import HOST, LivePage
+    from splatbot.services.viewer.door import opening_address
+
+    with LivePage(port) as page:
+        address = opening_address(page.access, HOST, page.port, to_terminal=sys.stdout.isatty())
+        print(f"{address} shows the training", flush=True)
+        yield page
+
+
+@contextmanager
+def _shown(session: TrainingSession, page: LivePage | None, name: str, *, quiet: bool) -> Iterator[StepObserver]:
+    """Yield the observer that shows a training on a page, and print its share of the time after the block."""
+    if page is None:
+        yield lambda loss: None
+        return
+    from splatbot.services.live_training.viewer import LiveTraining
+
+    live = LiveTraining(session, page, name)
+    try:
+        yield live
+    finally:
+        live.end()
+    if not quiet:
+        print(f"the viewer took {100 * live.budget.used:.1f} % of the time", flush=True)
 
 
 @contextmanager
@@ -346,7 +398,6 @@ def _print(folder: TrainingFolder, map_: Path, scores: dict[str, Any]) -> None:
     from splatbot.cli.tables import print_table
     from splatbot.results.units import count, decibels, number
 
-    corrected = "corrected_psnr_db"
     pictures = [folder.path / name for name in ("held_out.jpg", "course.png")]
     rows = [
         ("iterations", count(scores["iterations"])),
@@ -354,7 +405,7 @@ def _print(folder: TrainingFolder, map_: Path, scores: dict[str, Any]) -> None:
         ("Gaussians", f"{count(scores['gaussians'])}, SH degree {scores['sh_degree']}"),
         ("held-out views", str(scores["held_out"])),
         ("PSNR", decibels(scores["psnr_db"])),
-        *((("colour-corrected PSNR", decibels(scores[corrected])),) if corrected in scores else ()),
+        ("colour-corrected PSNR", decibels(scores["corrected_psnr_db"])),
         ("SSIM", number(scores["ssim"], 3)),
         *_camera_rows(folder),
         ("map", str(map_)),

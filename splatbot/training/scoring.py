@@ -35,8 +35,8 @@ class HeldOutScore:
         psnr_db: over the pixels that may be trained on [dB].
         ssim: over the whole image, 0 to 1, without pixels that may not be trained on; None if it was not wanted.
         images: (2, H, W, 3) uint8, the photograph and the map from its pose; None if they were not wanted.
-        corrected_psnr_db: PSNR after the affine colour transform of least squares between the map and the photograph
-            [dB]; None unless the training compensates exposures.
+        corrected_psnr_db: PSNR after the affine colour transform of least squares from the map to the photograph [dB];
+            None if it was not wanted.
     """
 
     name: str
@@ -60,8 +60,8 @@ def score_held_out(
     """Render each view of ``images`` and compare it with the photograph; views without a counted pixel are left out.
 
     With refined poses the map is free to move as a whole. Each view's pose is then aligned to the map first (Lin et al.
-    2021, BARF). With compensated exposures, the map has the mean exposure of the training views. PSNR is that of the
-    map as it is, and a second PSNR that after the best affine colour transform of the view.
+    2021, BARF). With compensated exposures the map has the mean exposure of the training views. PSNR is that of the map
+    as it is. The colour-corrected PSNR does not depend on the exposure of the view.
 
     Args:
         model: the map.
@@ -69,7 +69,7 @@ def score_held_out(
         options: of the training.
         extent: of the scene [m].
         every: score each such view only.
-        psnr_only: leave SSIM out.
+        psnr_only: leave SSIM and the colour-corrected PSNR out.
         shown: number of views, evenly spaced, whose images are kept.
         report: receives the number of views done.
     """
@@ -90,19 +90,19 @@ def score_held_out(
                 model, photo, poses.viewmats[index], background, model.sh_degree, antialiased=options.antialiased
             )
         image, colors = photo.over(background), render[..., :3]
-        render = colors.clamp(0, 1).contiguous()
         counted = torch.ones(image.shape[:2], dtype=torch.bool) if photo.trained is None else photo.trained
         corrected = None
-        if options.exposure:
+        if not psnr_only:
             transform = fitted_exposure(colors, alpha, background, image, counted)
-            corrected = exposed(colors, alpha, background, transform).clamp(0, 1)
+            corrected = _psnr(exposed(colors, alpha, background, transform), image, counted)
+        render = colors.clamp(0, 1).contiguous()
         scores.append(
             HeldOutScore(
                 images.views[index].name,
-                psnr(render[counted].numpy(), image[counted].numpy()),
+                _psnr(render, image, counted),
                 None if psnr_only else _ssim(render, image, photo),
                 (255 * torch.stack([image, render])).round().to(torch.uint8).numpy() if index in kept else None,
-                None if corrected is None else psnr(corrected[counted].numpy(), image[counted].numpy()),
+                corrected,
             )
         )
     return scores
@@ -110,10 +110,11 @@ def score_held_out(
 
 def summary(scores: list[HeldOutScore]) -> dict[str, Any]:
     """Return the means and the single values of scores, for JSON; the means are None without views."""
-    values = {"psnr_db": [s.psnr_db for s in scores], "ssim": [s.ssim or 0.0 for s in scores]}
-    corrected = [s.corrected_psnr_db for s in scores if s.corrected_psnr_db is not None]
-    if corrected:
-        values["corrected_psnr_db"] = corrected
+    values = {
+        "psnr_db": [s.psnr_db for s in scores],
+        "corrected_psnr_db": [s.corrected_psnr_db or 0.0 for s in scores],
+        "ssim": [s.ssim or 0.0 for s in scores],
+    }
     means = {name: round(fmean(of), 4) if of else None for name, of in values.items()}
     views = [
         {"name": score.name, **{name: round(of[index], 4) for name, of in values.items()}}
@@ -121,6 +122,10 @@ def summary(scores: list[HeldOutScore]) -> dict[str, Any]:
     ]
     found: dict[str, Any] = without_nan({"held_out": len(scores), **means, "views": views})
     return found
+
+
+def _psnr(render: Tensor, image: Tensor, counted: Tensor) -> float:
+    return psnr(render[counted].clamp(0, 1).numpy(), image[counted].numpy())
 
 
 def _ssim(render: Tensor, image: Tensor, photo: Photo) -> float:

@@ -91,8 +91,7 @@ def trained(data: TrainingData, *, exposure: bool) -> tuple[Trainer, float, floa
     trainer = Trainer(initial_model(data, images, most=1500, seed=0), images, options, data.scene_extent)
     for step in range(400):
         trainer.step(step / 400)
-    scored = replace(options, exposure=True)
-    scores = summary(score_held_out(trainer.model, ImageCache(held_out), scored, data.scene_extent))
+    scores = summary(score_held_out(trainer.model, ImageCache(held_out), options, data.scene_extent))
     return trainer, float(scores["psnr_db"]), float(scores["corrected_psnr_db"])
 
 
