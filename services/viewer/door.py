@@ -16,6 +16,7 @@ from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
 from splatbot.errors import NativeError
+from splatbot.service_key import key_file
 from splatbot.services.access import Access
 
 Check = Callable[[ServerConnection, Request], Response | None]
@@ -92,6 +93,13 @@ def _html(response: Response) -> Response:
     response.headers["Content-Type"] = "text/html; charset=utf-8"
     response.headers["Cache-Control"] = "no-store"
     return response
+
+
+def opening_address(access: Access, host: str, port: int, *, to_terminal: bool) -> str:
+    """Return the address that opens a viewer; its key is shown to a terminal only, and its file is named elsewhere."""
+    key = access.shown_key(to_terminal=to_terminal)
+    where = f" (KEY is in {key_file()})" if key is None and access.uses_key_file else ""
+    return f"http://{host}:{port}/?key={key or 'KEY'}{where}"
 
 
 @contextmanager

@@ -43,11 +43,11 @@ def view(
 
     from splatbot.atomic import atomic_write
     from splatbot.gaussians import GaussianModel, Snapshot
-    from splatbot.service_key import key_file
     from splatbot.services.access import Access
     from splatbot.services.runtime import check_exposure
     from splatbot.services.settings import load_settings
     from splatbot.services.store import MapStore
+    from splatbot.services.viewer.door import opening_address
     from splatbot.services.viewer.page import map_page
     from splatbot.services.viewer.viewer import Viewer
     from splatbot.trajectory import Trajectory
@@ -75,9 +75,8 @@ def view(
     access = Access(settings)
     viewer = Viewer(store, access, host=host, port=port, robot=robot)
     viewer.start()
-    key = access.shown_key(to_terminal=sys.stdout.isatty())
-    where = f" (KEY is in {key_file()})" if key is None and access.uses_key_file else ""
-    print(f"http://{host}:{viewer.port}/?key={key or 'KEY'} shows {file}{where}; Ctrl-C ends", flush=True)
+    address = opening_address(access, host, viewer.port, to_terminal=sys.stdout.isatty())
+    print(f"{address} shows {file}; Ctrl-C ends", flush=True)
     try:
         threading.Event().wait()
     finally:
