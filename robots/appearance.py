@@ -15,7 +15,6 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-import open3d as o3d
 import trimesh
 
 from splatbot.atomic import atomic_write
@@ -121,6 +120,8 @@ def _fingers(robot: RobotModel, triangles: Array, color: Color, opening: float |
 
 @cache
 def _ball() -> Array:
+    import open3d as o3d
+
     mesh = o3d.geometry.TriangleMesh.create_icosahedron()
     mesh = mesh.subdivide_loop(2)
     corners = np.asarray(mesh.vertices)

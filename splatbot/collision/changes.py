@@ -8,7 +8,6 @@ from typing import Literal
 
 import cv2
 import numpy as np
-import open3d as o3d
 from numpy.typing import NDArray
 
 from splatbot.collision.confirmed import find_confirmed
@@ -174,6 +173,8 @@ def _objects(kind: Kind, points: Array, colors: Array) -> list[ChangedObject]:
 
 def _box_axes(points: Array) -> Array:
     """Return the directions (3, 3) of the sides of the smallest box around points (P, 3), as columns."""
+    import open3d as o3d
+
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):  # it warns of rounded rotations
         return nearest_rotation(cloud.get_minimal_oriented_bounding_box(robust=True).R)

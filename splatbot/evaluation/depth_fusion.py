@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import open3d as o3d
 from numpy.typing import NDArray
 
 from splatbot.camera import Camera
@@ -39,6 +38,8 @@ class DepthFusion:
     """
 
     def __init__(self, voxel: float, farthest: float) -> None:
+        import open3d as o3d
+
         single, kinds = o3d.core.SizeVector((1,)), (o3d.core.float32, o3d.core.float32)
         self._grid = o3d.t.geometry.VoxelBlockGrid(
             ("tsdf", "weight"), kinds, (single, single), voxel, 16, CONSTANTS.blocks
@@ -47,6 +48,8 @@ class DepthFusion:
 
     def add(self, depth: NDArray[np.float32], camera: Camera, T_world_camera: Array) -> None:
         """Integrate one z-depth image (H, W) [m]; missing depth is 0 or not finite."""
+        import open3d as o3d
+
         known = np.isfinite(depth) & (depth < self._farthest)
         image = o3d.t.geometry.Image(o3d.core.Tensor.from_numpy(np.where(known, depth, 0).astype(np.float32)))
         K, T_camera_world = (o3d.core.Tensor.from_numpy(m) for m in (camera.K, inverse(T_world_camera)))

@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
-import open3d as o3d
 from scipy.spatial import cKDTree
 
 from splatbot.collision import GaussianCollisionField
@@ -22,6 +21,9 @@ from splatbot.grasping.measured import hand_penetration
 from splatbot.grasping.surface import GraspSurface
 from splatbot.protocols import Array, HandShape
 from splatbot.segmentation import SegmentedMap
+
+if TYPE_CHECKING:
+    import open3d as o3d
 
 
 @dataclass(frozen=True)
@@ -127,6 +129,8 @@ def relocate(scene: SegmentedMap, surface: GraspSurface, view: DepthView) -> Rel
         surface: surface of the target, from that map.
         view: the depth image, without the arm.
     """
+    import open3d as o3d
+
     seen = _points(view)
     middle, radius = surface.points.mean(axis=0), np.ptp(surface.points, axis=0).max() / 2
     seen = seen[np.linalg.norm(seen - middle, axis=1) < radius + 1.5 * CONSTANTS.max_shift]
@@ -228,6 +232,8 @@ def _shifted(source: Array, tree: cKDTree, normals: Array, up: Array) -> list[Ar
 
 def _turned(source: Array, target: o3d.geometry.PointCloud, start: Array) -> Array:
     """Register points (P, 3) to depth by a rigid motion (4, 4), from a start."""
+    import open3d as o3d
+
     registration = o3d.pipelines.registration
     tukey = registration.TukeyLoss(k=2 * CONSTANTS.close)
     moving = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(source))

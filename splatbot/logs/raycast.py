@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import open3d as o3d
 from numpy.typing import NDArray
 
 from splatbot.camera import Camera
 from splatbot.logs.shapes import TriangleMesh
 from splatbot.logs.textures import Texture
+
+if TYPE_CHECKING:
+    import open3d as o3d
 
 Array = NDArray[np.float64]
 
@@ -104,6 +106,8 @@ class _Body:
     """Surfaces of one rigid body. Open3D finds the triangle that a ray hits; the hit point is computed in float64."""
 
     def __init__(self, surfaces: Sequence[RaycastSurface]) -> None:
+        import open3d as o3d
+
         self.surfaces = list(surfaces)
         self._caster = o3d.t.geometry.RaycastingScene()
         normals, offsets = [], []
@@ -173,4 +177,6 @@ def _rotate(vectors: Array, R: Array) -> Array:
 
 
 def _tensor(array: NDArray[Any]) -> o3d.core.Tensor:
+    import open3d as o3d
+
     return o3d.core.Tensor.from_numpy(np.ascontiguousarray(array))

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import open3d as o3d
 from numpy.typing import NDArray
 
 from splatbot.protocols import Array
@@ -192,6 +191,8 @@ def nearest_of(points: Array, queries: Array) -> tuple[NDArray[np.int64], Array]
 
 
 def _search(points: Array, queries: Array, count: int) -> tuple[NDArray[np.int64], Array]:
+    import open3d as o3d
+
     search = o3d.core.nns.NearestNeighborSearch(o3d.core.Tensor.from_numpy(np.ascontiguousarray(points)))
     search.knn_index()
     index, square = search.knn_search(o3d.core.Tensor.from_numpy(np.ascontiguousarray(queries)), count)
