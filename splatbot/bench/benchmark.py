@@ -56,6 +56,7 @@ class Settings:
         json: Additional path for the JSON file.
         csv: Additional path for the CSV file.
         quick: Run a tiny workload in seconds, to check that the benchmark runs.
+        redraw: Do not measure; draw the plots again from the JSON file in the folder.
     """
 
     name: ClassVar[str]
@@ -66,6 +67,7 @@ class Settings:
     json: Annotated[Path | None, arg(metavar="FILE")] = None
     csv: Annotated[Path | None, arg(metavar="FILE")] = None
     quick: bool = False
+    redraw: bool = False
 
     def validate(self) -> None:
         """Raise an InputError for a value that makes no sense."""
@@ -110,11 +112,15 @@ class Benchmark:
     violations: Callable[[Results], list[str]] = lambda results: []
 
     def run(self, settings: Settings, report_progress: ReportProgress = ignore_progress) -> Results:
-        """Measure, and write the JSON and CSV files and the plots.
+        """Measure, and write the JSON and CSV files and the plots; with ``redraw`` only the plots.
 
         Raises:
-            InputError: A setting makes no sense.
+            InputError: A setting makes no sense, or there are no results to draw.
         """
+        if settings.redraw:
+            results = Results.read_json(settings.folder / f"{settings.stem}.json")
+            self.plot(results, settings.folder)
+            return results
         settings.validate()
         if settings.quick:
             settings = replace(settings, **settings.quick_values)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splatbot.atomic import atomic_write
+from splatbot.errors import InputError
 
 if TYPE_CHECKING:
     from splatbot.bench.timing import Timing
@@ -23,7 +24,7 @@ class Row:
         metric: name of the value, as in "forward".
         value: the value. If None, ``note`` gives the reason.
         unit: unit of the value; "x" for a ratio.
-        spread: median minus least of the repeated runs, in the same unit.
+        spread: in the same unit; of a time, median minus least of the repeated runs; of a mean, the standard deviation.
         peer: the measured peer, or the reference of the ratio. If None, the value is splatbot's.
     """
 
@@ -43,7 +44,7 @@ class Results:
     machine: dict[str, Any]
     rows: list[Row] = field(default_factory=list)
     curves: dict[str, Any] = field(default_factory=dict)
-    """Data of plots that no row holds; they are not written."""
+    """Data of plots that no row holds, as JSON values."""
 
     def add(
         self,
@@ -52,11 +53,12 @@ class Results:
         value: float | None,
         unit: str,
         *,
+        spread: float | None = None,
         peer: str | None = None,
         note: str | None = None,
     ) -> None:
         """Append one value."""
-        self.rows.append(Row(case, metric, value, unit, peer=peer, note=note))
+        self.rows.append(Row(case, metric, value, unit, spread, peer, note))
 
     def add_time(self, case: str, metric: str, timing: Timing, *, peer: str | None = None) -> None:
         """Append the least time [ms], with the median's distance as its spread."""
@@ -74,10 +76,27 @@ class Results:
         return [row for row in self.rows if row.case.startswith(prefix)]
 
     def write_json(self, path: Path) -> None:
-        """Write ``{"machine": {...}, "rows": [{...}]}``."""
-        text = json.dumps({"machine": self.machine, "rows": [asdict(row) for row in self.rows]}, indent=1)
+        """Write ``{"machine": {...}, "rows": [{...}]}``, and ``"curves"`` if there are any."""
+        values = {"machine": self.machine, "rows": [asdict(row) for row in self.rows]}
+        text = json.dumps(values | ({"curves": self.curves} if self.curves else {}), indent=1)
         with atomic_write(path) as file:
             file.write(text.encode())
+
+    @classmethod
+    def read_json(cls, path: Path) -> Results:
+        """Read results that :meth:`write_json` wrote.
+
+        Raises:
+            InputError: the file is missing or has other content.
+        """
+        try:
+            values = json.loads(path.read_text())
+            return cls(values["machine"], [Row(**row) for row in values["rows"]], values.get("curves", {}))
+        except FileNotFoundError:
+            hint = "run the benchmark first, or give the folder of its results"
+            raise InputError("does not exist.", file=path, field="--out", hint=hint) from None
+        except (ValueError, TypeError, KeyError) as error:
+            raise InputError(f"is no file of results ({error}).", file=path, hint="run the benchmark again") from error
 
     def write_csv(self, path: Path) -> None:
         """Write the rows alone."""

@@ -83,9 +83,10 @@ def _measure(settings: CollisionSettings, report_progress: ReportProgress) -> Re
 
 
 def _plot(results: Results, folder: Path) -> None:
-    from splatbot.bench.collision.plots import plot_accuracy
+    from splatbot.bench.collision.plots import plot_accuracy, plot_sigma
 
     plot_accuracy(results, folder)
+    plot_sigma(results, folder)
 
 
 BENCHMARK = Benchmark(

@@ -1,54 +1,66 @@
-"""Curves of `splatbot bench collision`: error against time."""
+"""Curves of `splatbot bench collision`: error against time, and over n_sigma."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
-import matplotlib
+from scipy.stats import binomtest
 
-matplotlib.use("Agg")
-from matplotlib import pyplot as plt
-
+from splatbot.bench.plots import Curve, Panel, Point, save_plot
 from splatbot.bench.results import Results
+
+_DEFAULT = " (default)"
 
 
 def plot_accuracy(results: Results, out: Path) -> None:
-    """Write ``collision-accuracy.png`` and ``.svg``: errors of configurations over n_sigma, of edges over time."""
-    figure, axes = plt.subplots(1, 2, figsize=(10, 3.9))
-    rows = [row.case for row in results.rows if row.case.startswith("sweep n_sigma") and row.metric == "false hit"]
-    most = max(
-        (case.split(" on ")[1].split(" Gaussians")[0] for case in rows), key=lambda n: rows_of(rows, n), default=""
-    )
-    for metric, marker in (("false hit", "o-"), ("false free", "s--")):
-        points = [
-            (float(row.case.rpartition(": ")[2].split()[0]), row.value)
-            for row in results.select(f"sweep n_sigma on {most} ")
-            if row.metric == metric and row.value is not None
-        ]
-        if points:
-            axes[0].plot(*zip(*sorted(points), strict=True), marker, label=metric)
-    axes[0].axvline(2.0, color="#d1495b", linestyle=":", label="default")
-    axes[0].set(title=f"configurations, {most} Gaussians", xlabel="n_sigma", ylabel="%")
-    axes[0].set_yscale("symlog", linthresh=1e-3)
-    cases = dict.fromkeys(row.case for row in results.select("sweep edges on "))
-    for case in cases:
-        us, free, hit = (results.find(case, metric) for metric in ("an edge", "false free", "false hit"))
-        if us is None or free is None or hit is None:
+    """Write ``collision-accuracy.png``, ``.svg``: missed collisions of edges over time, certified and sampled."""
+    cases = list(dict.fromkeys(row.case for row in results.select("sweep edges on ")))
+    curves = []
+    for name, of_curve in (("certified", True), ("sampled", False)):
+        chosen = [case for case in cases if ("certified" in case) is of_curve]
+        times = [results.find(case, "an edge") for case in chosen]
+        curves.append(Curve(f"{name} edges", _missed(results, chosen, times)))
+    panel = Panel("Collision checks of edges", "time of an edge [µs]", "missed collisions [%]", curves, "log", "log")
+    save_plot([panel], out, "collision-accuracy")
+
+
+def plot_sigma(results: Results, out: Path) -> None:
+    """Write ``collision-sigma.png``, ``.svg``: errors over n_sigma, for the number of Gaussians with most values."""
+    by_map: dict[str, list[str]] = {}
+    for case in dict.fromkeys(row.case for row in results.select("sweep n_sigma on ")):
+        by_map.setdefault(case.partition(":")[0], []).append(case)
+    if not by_map:
+        return
+    title, cases = max(by_map.items(), key=lambda item: len(item[1]))
+    sigmas = [float(_setting(case)) for case in cases]
+    hits = [
+        Point(x, y, default=case.endswith(_DEFAULT))
+        for case, x in zip(cases, sigmas, strict=True)
+        if (y := results.find(case, "false hit")) is not None
+    ]
+    curves = [Curve("false hit", hits), Curve("false free", _missed(results, cases, sigmas, labelled=False))]
+    name = f"Configurations, {title.removeprefix('sweep n_sigma on ')}"
+    save_plot([Panel(name, "n_sigma", "wrong answers [%]", curves, "linear", "log")], out, "collision-sigma")
+
+
+def _missed(
+    results: Results, cases: Sequence[str], places: Sequence[float | None], *, labelled: bool = True
+) -> list[Point]:
+    """Return the shares of missed collisions [%] at places, with 95 % intervals (Wilson 1927)."""
+    points = []
+    for case, x in zip(cases, places, strict=True):
+        found = [row for row in results.select(case) if row.metric == "false free, count" and row.case == case]
+        if x is None or not found or found[0].value is None:
             continue
-        label = case.rpartition(": ")[2]
-        axes[1].plot([us], [free], "s", color="#d1495b" if "default" in label else "#2a6f97")
-        axes[1].annotate(label, (us, free), textcoords="offset points", xytext=(4, 4), fontsize=7)
-    axes[1].set(title="edges of 1 rad", xlabel="us an edge", ylabel="false free [%]")
-    axes[1].set_yscale("symlog", linthresh=1e-3)
-    for axis in axes:
-        axis.grid(alpha=0.3)
-    axes[0].legend(fontsize=8)
-    figure.tight_layout()
-    for suffix in ("png", "svg"):
-        figure.savefig(out / f"collision-accuracy.{suffix}", dpi=130)
-    plt.close(figure)
+        missed, total = int(found[0].value), int(found[0].unit.removeprefix("of "))
+        interval = binomtest(missed, max(total, 1)).proportion_ci(method="wilson")
+        bar = (100.0 * max(interval.low, 0.0), 100.0 * interval.high)
+        label = _setting(case).removeprefix("certified, ") if labelled else ""
+        points.append(Point(x, 100.0 * missed / max(total, 1), label, case.endswith(_DEFAULT), *bar))
+    return points
 
 
-def rows_of(cases: list[str], count: str) -> int:
-    """Count the cases of a number of Gaussians."""
-    return sum(f" on {count} Gaussians" in case for case in cases)
+def _setting(case: str) -> str:
+    """Return the setting of a case, as in "sweep n_sigma on 200000 Gaussians: 2 (default)"."""
+    return case.rpartition(": ")[2].removesuffix(_DEFAULT)

@@ -13,6 +13,7 @@ from splatbot.bench.benchmark import ReportProgress, ignore_progress
 from splatbot.bench.grasping import GraspingSettings
 from splatbot.bench.grasping.scenes import over_scenes
 from splatbot.bench.machine import describe_machine
+from splatbot.bench.plots import Curve, Panel, Point, save_plot
 from splatbot.bench.results import Results
 from splatbot.grasping.affordance import AffordanceError
 from splatbot.sim.compare.agreement import wilson
@@ -99,28 +100,19 @@ def fit_logistic(x: np.ndarray, success: np.ndarray, steps: int = 100) -> tuple[
 
 def plot_reliability(results: Results, folder: Path) -> None:
     """Draw the share of successes over confidence, with 95 % intervals (Wilson 1927) and the diagonal."""
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    import matplotlib.pyplot as plt
-
     bins: dict[str, dict[str, float]] = {}
     for row in results.rows:
         if row.case.startswith("confidence ") and row.value is not None:
             bins.setdefault(row.case, {})[row.metric] = row.value
-    figure, axes = plt.subplots(figsize=(5, 4))
-    axes.plot([0, 1], [0, 1], color="0.6", linewidth=1, label="calibrated")
+    points = []
     for found in bins.values():
         if "succeeded" in found:
-            n, x, y = found["grasps"], found["confidence, mean"], found["succeeded"]
+            n, y = found["grasps"], found["succeeded"]
             interval = wilson(round(y * n), round(n))
-            assert interval.low is not None
-            assert interval.high is not None
-            axes.errorbar([x], [y], [[y - interval.low], [interval.high - y]], fmt="o", color="tab:blue", capsize=3)
-            axes.annotate(f"{n:.0f}", (x, y), textcoords="offset points", xytext=(7, -3), fontsize=8)
-    axes.set(xlabel="stated confidence", ylabel="succeeded in the held-out twin", xlim=(0, 1.03), ylim=(0, 1.03))
-    axes.set_title("Reliability of grasps (simulated; numbers are grasps)", fontsize=10)
-    axes.legend(loc="upper left")
-    figure.tight_layout()
-    figure.savefig(folder / "reliability.png", dpi=110)
-    plt.close(figure)
+            points.append(Point(found["confidence, mean"], y, f"{n:.0f}", low=interval.low, high=interval.high))
+    curves = [
+        Curve("calibrated", [Point(0.0, 0.0), Point(1.0, 1.0)], "reference"),
+        Curve("grasps (simulated), with their number", points, "points"),
+    ]
+    panel = Panel("Reliability of grasps", "stated confidence", "share of successes", curves)
+    save_plot([panel], folder, "reliability")

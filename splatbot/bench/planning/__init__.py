@@ -110,10 +110,8 @@ def _plot(results: Results, folder: Path) -> None:
     from splatbot.bench.planning.margin_sweep import plot_margins
     from splatbot.bench.planning.plots import plot_cost
 
-    for name, (curve, marks) in results.curves.get("margins", {}).items():
-        plot_margins(name, curve, marks, folder)
-    if "histories" in results.curves:
-        plot_cost(results.curves["histories"], results.curves["peers"], folder)
+    plot_margins(results, folder)
+    plot_cost(results, folder)
 
 
 _EXACT_CASES = (BUDGET, FAR_CHANGE, NEAR_CHANGE, MEMORY)

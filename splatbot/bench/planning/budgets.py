@@ -62,20 +62,15 @@ def run_planning(settings: PlanningSettings, report_progress: ReportProgress = i
         truth = Truth(scene, 0.1 if settings.quick else 0.02)
         wanted = problems(panda(), planner.arm, planner.field, truth, settings.problems)
         costs: dict[float, Array] = {}
-        histories: list[Array] = []
         for budget in settings.budgets:
             report_progress(f"budget {budget:g} ms")
-            costs[budget], histories = run_budget(settings, results, planner, truth, wanted, budget)
+            costs[budget] = run_budget(settings, results, planner, truth, wanted, budget)
             settings.save(results)
         report_progress("maps that change")
         run_changes(settings, results, model, wanted)
         add_memory(results, scene.gaussians(settings.memory_gaussians), planner)
-        theirs: dict[str, dict[float, Array]] = {}
         if settings.peers:
-            theirs = run_peers(
-                results, scene, planner, wanted, settings.peer_budgets, costs, audit, truth, report_progress
-            )
-    results.curves.update(histories=histories, peers=theirs)
+            run_peers(results, scene, planner, wanted, settings.peer_budgets, costs, audit, truth, report_progress)
     return results
 
 
@@ -124,8 +119,11 @@ def run_budget(
     truth: Truth,
     wanted: Sequence[Problem],
     budget: float,
-) -> tuple[Array, list[Array]]:
-    """Plan all problems with one budget; return costs (P,) of the first seed, NaN if unsolved, and its histories."""
+) -> Array:
+    """Plan all problems with one budget; return costs (P,) of the first seed, NaN if unsolved.
+
+    The spread of the mean cost is one standard deviation between the seeds.
+    """
     case = f"budget {budget:g} ms"
     seeds = settings.seeds if budget <= 100.0 else 1
     runs: list[PlanResult] = []
@@ -151,12 +149,14 @@ def run_budget(
         results.add(
             case, "cost of the first path, mean", float(np.mean([run.history[0, 1] for run in runs if run])), "rad"
         )
-        results.add(case, "cost, mean", float(np.nanmean(costs)), "rad")
+        of_seeds = np.nanmean(costs.reshape(seeds, -1), axis=1)
+        deviation = float(np.nanstd(of_seeds, ddof=1)) if seeds > 1 else None
+        results.add(case, "cost, mean", float(np.nanmean(costs)), "rad", spread=deviation)
         results.add(case, "uncertified paths", float(sum(not path.certificate.certified for path in paths)), "paths")
         promised = [path.certificate.clearance for path in paths]
         results.add(case, "certified clearance, median", 1e3 * float(np.median(promised)), "mm")
         add_audit(results, case, [path.waypoints for path in paths], planner.arm, truth, promised)
-    return costs[: len(wanted)], [run.history for run in runs[: len(wanted)] if run]
+    return costs[: len(wanted)]
 
 
 def add_audit(

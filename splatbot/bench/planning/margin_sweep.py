@@ -6,13 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")
 import numpy as np
-from matplotlib import pyplot as plt
 
 from splatbot.bench.planning_problems import Problem
+from splatbot.bench.plots import Curve, Panel, Point, save_plot
 from splatbot.bench.results import Results
 from splatbot.collision import GaussianCollisionField
 from splatbot.collision.audit import SurfaceAudit
@@ -54,7 +51,7 @@ def sweep_margins(
     are free without a margin.
 
     Args:
-        results: receives the rows, and the curve of the plot.
+        results: receives the rows.
         name: name of the run.
         audit: confirmed points of the run.
         field: collision field of its map.
@@ -62,7 +59,6 @@ def sweep_margins(
         problems: the problems.
         budget_ms: time of a plan [ms].
     """
-    curve = []
     for margin in CONSTANTS.margins:
         planner = GaussianRRTStar(field, panda(), T_world_base=T_world_base, margin=margin)
         solved = [bool(planner.plan(p.start, p.goal, budget_ms=budget_ms, seed=k)) for k, p in enumerate(problems)]
@@ -76,31 +72,24 @@ def sweep_margins(
         case = f"{name}, margin {1e3 * margin:.0f} mm"
         for metric, value in zip(("missed surface", "false hits", "solved"), row, strict=True):
             results.add(case, metric, value, "%")
-        curve.append((margin, *row))
-    marks = {share: audit.quantile(share) for share in CONSTANTS.confidences}
-    for share, margin in marks.items():
-        results.add(f"{name}, margin at confidence", f"{share:g}", 1e3 * margin, "mm")
-    results.curves.setdefault("margins", {})[name] = (np.array(curve), marks)
+    for share in CONSTANTS.confidences:
+        results.add(f"{name}, margin at confidence", f"{share:g}", 1e3 * audit.quantile(share), "mm")
 
 
-def plot_margins(name: str, curve: Array, marks: dict[float, float], out: Path) -> None:
-    """Write ``planning-margins-NAME.png``: the three shares over the margin, and the margins at confidences.
-
-    Args:
-        name: name of the run.
-        curve: (M, 4) margin [m], missed, false hits, solved [%].
-        marks: margin [m] by confidence.
-        out: a folder.
-    """
-    figure, axis = plt.subplots(figsize=(6.4, 3.9))
-    for column, label, style in ((1, "missed surface", "o-"), (2, "false hits", "s-"), (3, "solved problems", "^-")):
-        axis.plot(1e3 * curve[:, 0], np.maximum(curve[:, column], 1e-3), style, markersize=4, label=label)
-    for share, margin in marks.items():
-        axis.axvline(1e3 * margin, color="0.6", linewidth=0.8, linestyle=":")
-        axis.annotate(f"{share:g}", (1e3 * margin, 1.3e-3), fontsize=7, rotation=90, color="0.4")
-    axis.set(yscale="log", xlabel="margin [mm]", ylabel="share [%], 0.001 and less at the bottom", title=name)
-    axis.grid(alpha=0.3)
-    axis.legend(fontsize=8)
-    figure.tight_layout()
-    figure.savefig(out / f"planning-margins-{name}.png", dpi=130)
-    plt.close(figure)
+def plot_margins(results: Results, out: Path) -> None:
+    """Write ``planning-margins-NAME.png``, ``.svg`` of each run: the three shares over the margin, and confidences."""
+    runs = dict.fromkeys(row.case.rpartition(", margin at confidence")[0] for row in results.rows)
+    for name in (name for name in runs if name):
+        curves = []
+        for metric in ("missed surface", "false hits", "solved"):
+            rows = [row for row in results.select(f"{name}, margin ") if (row.metric, row.unit) == (metric, "%")]
+            shares = [Point(float(row.case.split()[-2]), row.value) for row in rows if row.value is not None]
+            curves.append(Curve(metric, shares))
+        marks = [
+            Point(row.value, 100.0 * (1.0 - float(row.metric)), row.metric)
+            for row in results.select(f"{name}, margin at confidence")
+            if row.value is not None
+        ]
+        curves.append(Curve("margin at confidence", marks, "points"))
+        panel = Panel(name, "margin [mm]", "share [%]", curves, "linear", "log")
+        save_plot([panel], out, f"planning-margins-{name}")

@@ -36,14 +36,14 @@ def run_peers(
     audit: Audit,
     truth: Truth,
     report_progress: ReportProgress,
-) -> dict[str, dict[float, Array]]:
-    """Measure the peers; return the costs (P,) of those that improve a path, by name and budget [ms]."""
+) -> None:
+    """Measure the peers: first paths, and costs over budgets of those that improve a path."""
     missing = importlib.util.find_spec("vamp") is None
     note = "absent: vamp is not installed (it has no wheel)" if missing else "not driven by this benchmark"
     results.add("first path", "time, median", None, "ms", peer="VAMP", note=note)
     if importlib.util.find_spec("ompl") is None:
         results.add("first path", "time, median", None, "ms", peer="OMPL", note="absent: ompl is not installed")
-        return {}
+        return
     arm = planner.arm
     motion = _certified_edges(planner)
     checks: list[tuple[str, Callable[[Array], bool], Callable[[Array, Array], bool] | None]] = [
@@ -58,7 +58,6 @@ def run_peers(
     for name, states, edges in checks:
         report_progress(name)
         _first_paths(results, name, _Ompl(arm, states, edges), wanted, audit, truth)
-    theirs: dict[str, dict[float, Array]] = {}
     problem = _Ompl(arm, _field_states(planner), motion)
     for planner_name in IMPROVING:
         for budget in budgets_ms:
@@ -66,14 +65,12 @@ def run_peers(
             found = [problem.solve(planner_name, p, 1e-3 * budget) for p in wanted]
             cost = np.array([np.nan if path is None else _length(path) for path, _ in found])
             name = f"OMPL {planner_name}, field"
-            theirs.setdefault(name, {})[budget] = cost
             case = f"budget {budget:g} ms"
             results.add(case, "solved", float(np.isfinite(cost).sum()), f"of {len(wanted)}", peer=name)
             if np.isfinite(cost).any():
                 results.add(case, "cost, mean", float(np.nanmean(cost)), "rad", peer=name)
             for own, costs in ours.items():
                 add_ratio(results, f"budget {own:g} ms against its {budget:g} ms", costs, cost, name)
-    return theirs
 
 
 def add_ratio(results: Results, case: str, ours: Array, theirs: Array, peer: str) -> None:

@@ -2,44 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")
-import numpy as np
-from matplotlib import pyplot as plt
-
-from splatbot.protocols import Array
+from splatbot.bench.planning import BUDGET
+from splatbot.bench.plots import Curve, Panel, Point, save_plot
+from splatbot.bench.results import Results
 
 DEFAULT_MS = 28.0
 
 
-def plot_cost(histories: Sequence[Array], peers: Mapping[str, Mapping[float, Array]], out: Path) -> None:
-    """Write ``planning-cost.png`` and ``.svg``: the mean cost of all problems over time, with peers' at their budgets.
+def plot_cost(results: Results, out: Path) -> None:
+    """Write ``planning-cost.png``, ``.svg``: the mean length of paths over the budget, with peers.
 
-    Args:
-        histories: (H, 2) of (seconds, cost [rad]) of each problem.
-        peers: costs (P,) [rad] by budget [ms], NaN where unsolved, by name.
-        out: a folder.
+    Error bars are one standard deviation between the seeds. The label of a budget has the share of solved problems
+    where it is below 100 %.
     """
-    figure, axis = plt.subplots(figsize=(6.4, 3.9))
-    if histories:
-        begin = float(np.percentile([h[0, 0] for h in histories], 95))  # nearly all have a path
-        end = max(float(h[-1, 0]) for h in histories)
-        at = np.geomspace(begin, max(end, 2 * begin), 200)
-        mean = [np.mean([h[h[:, 0] <= t][-1, 1] for h in histories if h[0, 0] <= t]) for t in at]
-        axis.plot(1e3 * at, mean, color="#d1495b", label="splatbot")
-        axis.axvline(DEFAULT_MS, color="#d1495b", linestyle=":", label="default budget")
-    for name, costs in peers.items():
-        points = [(ms, float(np.nanmean(c))) for ms, c in sorted(costs.items()) if np.isfinite(c).any()]
-        if points:
-            axis.plot(*zip(*points, strict=True), "o-", markersize=4, label=name)
-    axis.set(xscale="log", xlabel="ms", ylabel="mean cost of solved problems [rad]", title="path cost over time")
-    axis.grid(alpha=0.3)
-    axis.legend(fontsize=8)
-    figure.tight_layout()
-    for suffix in ("png", "svg"):
-        figure.savefig(out / f"planning-cost.{suffix}", dpi=130)
-    plt.close(figure)
+    curves: dict[str, list[Point]] = {}
+    for row in results.select(f"{BUDGET} "):
+        if row.metric != "cost, mean" or row.value is None:
+            continue
+        budget = float(row.case.split()[1])
+        low, high = (None, None) if row.spread is None else (row.value - row.spread, row.value + row.spread)
+        label = "" if row.peer else f"{budget:g} ms{_solved(results, row.case)}"
+        point = Point(budget, row.value, label, row.peer is None and budget == DEFAULT_MS, low, high)
+        curves.setdefault(row.peer or "splatbot", []).append(point)
+    drawn = [Curve(name, points) for name, points in curves.items()]
+    save_plot([Panel("Planning", "time budget [ms]", "path length, mean [rad]", drawn, "log")], out, "planning-cost")
+
+
+def _solved(results: Results, case: str) -> str:
+    """Return the share of solved problems of a case, as in ", 98 % solved"; empty for all."""
+    for row in results.select(case):
+        if (row.case, row.metric, row.peer) == (case, "solved", None) and row.value is not None:
+            share = row.value / float(row.unit.removeprefix("of "))
+            return "" if share == 1.0 else f", {100 * share:.3g} % solved"
+    return ""

@@ -4,26 +4,22 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")
-from matplotlib import pyplot as plt
-
+from splatbot.bench.plots import Curve, Panel, Point, save_plot
 from splatbot.bench.results import Results
 
 
 def plot_utilisation(results: Results, out: Path) -> None:
     """Write ``sizing.png`` and ``.svg``: the share of each resource in use on the planned nodes."""
     robots, shares = results.curves["robots"], results.curves["utilisation"]
-    figure, axis = plt.subplots(figsize=(7.2, 4.4))
-    for name in shares[0]:
-        axis.plot(robots, [100 * share[name] for share in shares], label=name)
-    axis.axhline(100.0, color="#d1495b", linestyle=":")
-    axis.axvline(results.curves["planned"], color="#8d99ae", linestyle=":", label="planned")
-    axis.set(xscale="log", yscale="log", xlabel="robots (simulated)", ylabel="utilisation [%]", ylim=(0.1, 1000.0))
-    axis.grid(alpha=0.3, which="both")
-    axis.legend(fontsize=8, loc="upper left", ncols=2)
-    figure.tight_layout()
-    for suffix in ("png", "svg"):
-        figure.savefig(out / f"sizing.{suffix}", dpi=130)
-    plt.close(figure)
+    curves = [
+        Curve(name, [Point(x, 100.0 * share[name]) for x, share in zip(robots, shares, strict=True)], "line")
+        for name in shares[0]
+    ]
+    planned = results.curves["planned"]
+    full = [
+        Point(min(robots), 100.0),
+        Point(planned, 100.0, f"{planned:g} planned", default=True),
+        Point(max(robots), 100.0),
+    ]
+    curves.append(Curve("100 %", full, "reference"))
+    save_plot([Panel("Utilisation", "robots (simulated)", "utilisation [%]", curves, "log", "log")], out, "sizing")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from splatbot.bench.planning.margin_sweep import CONSTANTS, plot_margins, sweep_margins
 from splatbot.bench.planning_problems import Problem
@@ -26,12 +27,15 @@ def test_missed_surface_falls_and_false_hits_rise_with_the_margin(tmp_path: Path
     start = np.array(panda().home)
     problem = Problem(start, start + 0.2)
     sweep_margins(results, "ball", audit_surfaces(field, space), field, np.eye(4), [problem], budget_ms=20.0)
-    curve, marks = results.curves["margins"]["ball"]
-    np.testing.assert_allclose(curve[:, 0], CONSTANTS.margins)
+    cases = [f"ball, margin {1e3 * margin:.0f} mm" for margin in CONSTANTS.margins]
+    missed, hits, solved = (
+        np.array([results.find(case, metric) for case in cases], np.float64)
+        for metric in ("missed surface", "false hits", "solved")
+    )
     expected = [100.0 * np.mean(ray > margin + 1e-5) for margin in CONSTANTS.margins]
-    np.testing.assert_allclose(curve[:, 1], expected, atol=5.0)
-    np.testing.assert_allclose(curve[:, 1] + curve[:, 2], 100.0, atol=5.0)  # the same points count as free here
-    assert (curve[:, 3] == 100.0).all()
-    assert abs(marks[0.9] - 0.018) < 1e-4
-    plot_margins("ball", curve, marks, tmp_path)
+    np.testing.assert_allclose(missed, expected, atol=5.0)
+    np.testing.assert_allclose(missed + hits, 100.0, atol=5.0)  # the same points count as free here
+    assert (solved == 100.0).all()
+    assert results.find("ball, margin at confidence", "0.9") == pytest.approx(18.0, abs=0.1)
+    plot_margins(results, tmp_path)
     assert (tmp_path / "planning-margins-ball.png").stat().st_size > 1000

@@ -1,0 +1,53 @@
+"""Results of a benchmark in files, and plots that are drawn again from them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from splatbot.bench.results import Results, Row
+from splatbot.cli import main
+from splatbot.errors import InputError
+
+ROWS = [
+    Row("desk, 30 ms", "ATE", 3.0, "mm"),
+    Row("desk, 30 ms", "p50", 20.0, "ms"),
+    Row("desk, 100 ms", "ATE", 2.0, "mm"),
+    Row("desk, 100 ms", "p50", 40.0, "ms"),
+    Row("desk, 100 ms", "NEES / 6", None, "", note="fewer than ten frames"),
+]
+MACHINE = {"cpu": "a CPU", "cpus": 2, "isa": "v3", "fma_peak_gflops": {"v3": {"1": 50.0}}, "load_1min": 0.1}
+
+
+def test_written_results_are_read_as_they_were(tmp_path: Path) -> None:
+    results = Results(
+        MACHINE, [*ROWS, Row("a", "b", 1.0, "ms", spread=0.1, peer="other")], {"(default)": [[1.0, 20.5]]}
+    )
+    results.write_json(tmp_path / "a.json")
+    assert Results.read_json(tmp_path / "a.json") == results
+
+
+@pytest.mark.parametrize(
+    "text", ["{", "[]", "{}", '{"machine": {}, "rows": [{"case": 1}]}', '{"machine": {}, "rows": 3}']
+)
+def test_a_damaged_file_is_named_with_the_fix(text: str, tmp_path: Path) -> None:
+    (tmp_path / "tracking.json").write_text(text)
+    with pytest.raises(InputError, match=r"tracking\.json.*Fix:"):
+        Results.read_json(tmp_path / "tracking.json")
+
+
+def test_redraw_draws_the_plot_of_saved_results_and_prints_their_table(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Results(MACHINE, ROWS).write_json(tmp_path / "tracking.json")
+    before = (tmp_path / "tracking.json").read_bytes()
+    assert main(["bench", "tracking", "--redraw", "--out", str(tmp_path)]) == 0
+    assert "desk" in capsys.readouterr().out
+    assert {path.name for path in tmp_path.iterdir()} == {"tracking.json", "tracking.png", "tracking.svg"}
+    assert (tmp_path / "tracking.json").read_bytes() == before
+
+
+def test_redraw_without_results_names_the_missing_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench", "planning", "--redraw", "--out", str(tmp_path)]) == 2
+    assert "planning.json" in capsys.readouterr().err
