@@ -66,6 +66,13 @@ check: $(WERROR_STAMP) ## ruff, mypy, layering contract, prose, and the native c
 figures: $(INSTALL_STAMP) ## run the commands behind the figures of the documentation, and compare (minutes; needs the test data)
 	$(BIN)/python -m tests.figures
 
+CURVES := runs/bench-tracking/tracking.png runs/bench-collision/collision-accuracy.png \
+  runs/bench-collision/collision-sigma.png runs/bench-planning/planning-cost.png
+.PHONY: curves
+curves: $(INSTALL_STAMP) ## draw the curves of README.md again, from the results of splatbot bench tracking, collision and planning
+	for name in tracking collision planning; do $(BIN)/splatbot bench $$name --redraw; done
+	cp $(CURVES) docs/images/
+
 .PHONY: docs
 docs: export NO_MKDOCS_2_WARNING := 1
 docs: $(INSTALL_STAMP) ## the documentation as a site without a server: build/site/index.html

@@ -35,7 +35,7 @@ class PlotConstants:
         panel: width and height of a panel [inch].
         columns: most panels side by side.
         dpi: pixels of an inch.
-        turns: places around a point that are tried for its label, from near to far.
+        turns: places around a point that are tried for its label, the nearest first.
         gap: [pt] least distance between a label and other marks.
         nearer: distance of a label from its point, relative to that from the nearest other, above which a line leads
             to its point.
@@ -88,7 +88,7 @@ class Point:
         x, y: its place in the units of the axes. If one is not finite, the point is left out.
         label: name of the setting. Equal labels of a panel are written once.
         default: whether it is the default setting.
-        low, high: ends of the error bar, in the unit of y. If None, there is none.
+        low, high: ends of the error bar, in the unit of y. If None, there is no bar.
     """
 
     x: float
@@ -311,7 +311,7 @@ def _obstacles(axis: Axes, points: Iterable[Point]) -> Iterable[Bbox]:
 
 
 def _free_boxes(axis: Axes, text: Annotation, at: Any, taken: Sequence[Bbox]) -> Any:
-    """Return boxes (N, 4) [px] of free places for a text on a spiral around a point, from near to far."""
+    """Return boxes (N, 4) [px] of free places for a text on a spiral around a point, the nearest first."""
     box, room, gap = text.get_window_extent(), axis.get_window_extent(), CONSTANTS.gap * _pixels(axis)
     half = np.array([box.width, box.height]) / 2 + gap
     full = np.array([b.extents for b in taken])

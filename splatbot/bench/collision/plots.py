@@ -17,10 +17,10 @@ def plot_accuracy(results: Results, out: Path) -> None:
     """Write ``collision-accuracy.png``, ``.svg``: missed collisions of edges over time, certified and sampled."""
     cases = list(dict.fromkeys(row.case for row in results.select("sweep edges on ")))
     curves = []
-    for name, of_curve in (("certified", True), ("sampled", False)):
-        chosen = [case for case in cases if ("certified" in case) is of_curve]
+    for name, certified in (("certified, tolerance", True), ("sampled, samples", False)):
+        chosen = [case for case in cases if ("certified" in case) is certified]
         times = [results.find(case, "an edge") for case in chosen]
-        curves.append(Curve(f"{name} edges", _missed(results, chosen, times)))
+        curves.append(Curve(name, _missed(results, chosen, times)))
     panel = Panel("Collision checks of edges", "time of an edge [µs]", "missed collisions [%]", curves, "log", "log")
     save_plot([panel], out, "collision-accuracy")
 
@@ -56,7 +56,7 @@ def _missed(
         missed, total = int(found[0].value), int(found[0].unit.removeprefix("of "))
         interval = binomtest(missed, max(total, 1)).proportion_ci(method="wilson")
         bar = (100.0 * max(interval.low, 0.0), 100.0 * interval.high)
-        label = _setting(case).removeprefix("certified, ") if labelled else ""
+        label = _setting(case).removeprefix("certified, ").removesuffix(" samples") if labelled else ""
         points.append(Point(x, 100.0 * missed / max(total, 1), label, case.endswith(_DEFAULT), *bar))
     return points
 
