@@ -16,11 +16,13 @@ class ViewerBudgetConstants:
 
     Args:
         share: of the elapsed time that the viewer may take.
-        burst: [s] most time that is saved up, and thus the longest prediction that work must wait for.
+        margin: credit that work needs to begin [predicted costs].
+        burst: [s] most time that is saved up, beyond that which dearer work needs.
         forgetting: factor by which a measured cost falls at the next, cheaper measurement.
     """
 
     share: float = 0.05
+    margin: float = 2.0
     burst: float = 0.5
     forgetting: float = 0.8
 
@@ -31,8 +33,8 @@ CONSTANTS = ViewerBudgetConstants()
 class ViewerBudget:
     """A credit of time that grows by a share of the elapsed time, and that work of the viewer uses up.
 
-    Work begins when the credit covers its predicted cost. Work that took longer leaves a debt, which is repaid before
-    the next begins.
+    Work begins when the credit covers its predicted cost with a margin. Work that took still longer leaves a debt,
+    which is repaid before the next begins.
 
     Args:
         clock: of the process.
@@ -43,13 +45,16 @@ class ViewerBudget:
         self.spent_s = 0.0
         self._began = self._then = clock()
         self._credit_s = 0.0
+        self._most_s = CONSTANTS.burst
 
     def covers(self, cost_s: float) -> bool:
         """Return whether work of a predicted cost [s] may begin now."""
-        now = self.clock()
-        self._credit_s = min(CONSTANTS.burst, self._credit_s + CONSTANTS.share * (now - self._then))
+        now, needed = self.clock(), CONSTANTS.margin * cost_s
+        if needed > CONSTANTS.burst:
+            self._most_s = needed + CONSTANTS.burst
+        self._credit_s = min(self._most_s, self._credit_s + CONSTANTS.share * (now - self._then))
         self._then = now
-        return self._credit_s >= min(cost_s, CONSTANTS.burst)
+        return self._credit_s >= needed
 
     def spend(self, seconds: float) -> None:
         """Charge time that the viewer took [s]."""
