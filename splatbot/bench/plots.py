@@ -105,7 +105,7 @@ class Curve:
 
     Args:
         name: in the legend.
-        points: its settings.
+        points: its settings, in the order of the knob.
         style: "joined" by a line, "points" alone, a "line" without markers, or a "reference" in grey, dotted.
     """
 
@@ -207,12 +207,12 @@ def _draw_panel(axis: Axes, panel: Panel, styles: dict[str, tuple[str, str]]) ->
 
 
 def _finite(curve: Curve, panel: Panel) -> list[Point]:
-    """Return the points that the axes can show, by x."""
+    """Return the points that the axes can show."""
 
     def shown(p: Point) -> bool:
         return math.isfinite(p.x) and math.isfinite(p.y) and (panel.x_scale == "linear" or p.x > 0.0)
 
-    return sorted((p for p in curve.points if shown(p)), key=lambda p: p.x)
+    return [p for p in curve.points if shown(p)]
 
 
 def _scale(axis: Axis, scale: Scale, values: Sequence[float]) -> None:
