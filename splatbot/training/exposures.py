@@ -16,8 +16,9 @@ class ExposureTransforms:
     therefore constrained to the identity: (1/C) Σ A = I and (1/C) Σ b = 0. A step adds Adam's increments less their
     mean over the photographs.
 
-    Adam steps all transforms at each step, as in the release of 3D Gaussian splatting (Kerbl et al. 2024). The gradient
-    of a photograph that the step does not see is 0.
+    Each photograph counts its own steps of Adam, with the rates of the release of 3D Gaussian splatting (Kerbl et al.
+    2024). There, Adam steps all photographs at once, mostly with a gradient of 0. A view then moves about √C times as far,
+    which follows its errors into colours that other views do not have.
 
     Args:
         count: C, the number of photographs.
@@ -39,13 +40,15 @@ class ExposureTransforms:
             rate: of each value.
         """
         increments = torch.zeros_like(self.first)
+        seen = torch.zeros(len(self.steps), dtype=torch.bool)
+        seen[views] = True
         adam_step(
             {"exposure": increments},
             {"exposure": torch.zeros_like(self.first).index_add_(0, torch.tensor(views), gradients.float())},
             {"exposure": self.first},
             {"exposure": self.second},
             self.steps,
-            torch.ones(len(self.steps), dtype=torch.bool),
+            seen,
             {"exposure": rate},
             betas=(0.9, 0.999),
             eps=1e-8,

@@ -19,6 +19,8 @@ from splatbot.training.scoring import score_held_out, summary
 from splatbot.training.trainer import Trainer
 from tests.unit.training.rendered import rendered_data
 
+pytestmark = pytest.mark.usefixtures("default_kernels")
+
 GRAY = 0.35
 
 
@@ -55,18 +57,20 @@ def test_the_transform_of_least_squares_is_the_one_that_a_photograph_has() -> No
 
 def test_a_step_is_that_of_adam_less_its_mean_and_the_mean_stays_the_identity() -> None:
     exposures, draws = ExposureTransforms(5), torch.Generator().manual_seed(1)
-    values = torch.zeros(5, 3, 4, requires_grad=True)
-    adam = torch.optim.Adam([values], lr=0.01)
+    values = [torch.zeros(3, 4, requires_grad=True) for _ in range(5)]
+    adam = torch.optim.Adam(values, lr=0.01)  # steps the values that have a gradient
     for step in range(40):
         views = torch.randint(5, (2,), generator=draws).tolist()  # a view may come twice
         gradients = torch.randn(2, 3, 4, generator=draws, dtype=torch.float64)
         rate = 0.01 * 0.1 ** (step / 40)
         exposures.step(views, gradients, rate)
         adam.param_groups[0]["lr"] = rate
-        values.grad = torch.zeros(5, 3, 4).index_add_(0, torch.tensor(views), gradients.float())
+        adam.zero_grad()
+        for view, gradient in zip(views, gradients, strict=True):
+            values[view].grad = gradient.float() + (0.0 if (grad := values[view].grad) is None else grad)
         adam.step()
     identity = torch.eye(3, 4, dtype=torch.float64)
-    moved = values.detach().double()
+    moved = torch.stack([value.detach().double() for value in values])
     torch.testing.assert_close(exposures.transforms, identity + moved - moved.mean(0), atol=1e-6, rtol=0)
     torch.testing.assert_close(exposures.transforms.mean(0), identity, atol=1e-12, rtol=0)
     assert float(moved.abs().max()) > 0.05
@@ -86,7 +90,7 @@ def with_gains(data: TrainingData, gains: NDArray[np.float64]) -> TrainingData:
 def trained(data: TrainingData, *, exposure: bool) -> tuple[Trainer, float, float]:
     """Train on the simulated scene; return the trainer, PSNR and colour-corrected PSNR of the held-out views [dB]."""
     train, held_out = data.split()
-    options = TrainingOptions(iterations=400, max_gaussians=1500, background="white", exposure=exposure)
+    options = TrainingOptions(iterations=400, batch=2, max_gaussians=1500, background="white", exposure=exposure)
     images = ImageCache(train)
     trainer = Trainer(initial_model(data, images, most=1500, seed=0), images, options, data.scene_extent)
     for step in range(400):
@@ -107,9 +111,9 @@ def test_photographs_of_different_gains_give_the_map_of_equal_ones() -> None:
     trainer, found, corrected = trained(with_gains(data, gains), exposure=True)
     print(f"held-out PSNR: {clean:.1f} dB of equal gains, {ignored:.1f} dB ignored, {found:.1f} dB compensated")
     print(f"colour-corrected: {corrected_clean:.1f} dB, {corrected_ignored:.1f} dB, {corrected:.1f} dB")
-    assert found > max(clean - 0.5, ignored + 1.0)
+    assert found > max(clean - 1.0, ignored + 1.5)
     assert corrected > max(corrected_clean - 0.5, corrected_ignored + 1.0)
     assert trainer.exposures is not None
     transforms = trainer.exposures.transforms
     gray = (GRAY * transforms[..., :3].sum(-1) + transforms[..., 3]).mean(-1).numpy() / GRAY
-    np.testing.assert_allclose(gray, gains[trains], rtol=0.08)
+    assert np.linalg.norm(gray - gains[trains]) < 0.5 * np.linalg.norm(1.0 - gains[trains])

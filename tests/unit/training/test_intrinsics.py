@@ -26,6 +26,8 @@ from splatbot.training.trainer import Trainer
 from splatbot.trajectory import Trajectory
 from tests.unit.training.rendered import CAMERA, photograph, rendered_data, true_model
 
+pytestmark = pytest.mark.usefixtures("default_kernels")
+
 
 def view_of(camera: Camera, name: str = "") -> TrainingView:
     return TrainingView("0", camera, np.eye(4), lambda: np.zeros((1, 1, 3), np.uint8), camera_name=name)
