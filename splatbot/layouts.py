@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Literal
 
-from splatbot.errors import FormatError, LogError
+from splatbot.errors import FormatError, InputError, LogError
 
 LogKind = Literal[
     "synthetic",
@@ -23,6 +24,8 @@ LogKind = Literal[
     "consecutive",
     "colmap",
 ]
+
+DatasetKind = Literal["colmap", "blender", "nerfstudio", "run"]
 
 REPLAY, OAK, REALSENSE = "replay:", "oak://", "realsense://"
 ORBBEC, OPENCV = "orbbec://", "opencv://"
@@ -51,6 +54,13 @@ _WITH_OPTIONS = ("bag", "lerobot", "tum", "colmap")  # kinds whose path may be f
 _COLMAP_MODELS = ("sparse/0", "sparse", ".", "0")  # in the folder of a scene, the preferred one first
 _HEAD = 2**20  # bytes of a JSON file that hold its description, or its first frames
 _AS_TUM = "write rgb/, depth/ (16-bit PNG), rgb.txt, depth.txt and intrinsics.json (docs/guide/mapping.md)"
+_DATASET_HINT = (
+    "give a folder with sparse/0/{cameras,images,points3D}.bin or .txt (COLMAP), transforms_train.json (Blender), "
+    "transforms.json (Nerfstudio, instant-ngp), or one that `splatbot map` wrote"
+)
+_DATASET_OF_RUN = (MAP_NAME, "trajectory.tum", "config.yaml")
+_RUN_HINT = "give a folder that `splatbot map` wrote"
+_MAP_HINT = f"give a map file ({', '.join(MAP_SUFFIXES)}), or a folder that `splatbot map` wrote"
 _FROM_A_LOG = f"map a recording; splatbot reads files of Gaussians ({', '.join(MAP_SUFFIXES)})"
 
 _PACKED = {
@@ -64,7 +74,9 @@ _PACKED = {
     ".7z": ("a 7-Zip archive", "7z x"),
     ".rar": ("a RAR archive", "unrar x"),
 }
+_PICTURES = (".png", ".jpg", ".jpeg")
 _FOREIGN_LOGS = {
+    **dict.fromkeys(_PICTURES, ("a picture", "give the folder or the file of its recording")),
     ".db3": ("one file of a rosbag2 recording", "name the folder that holds it and metadata.yaml"),
     ".mkv": (
         "an Azure Kinect recording",
@@ -85,6 +97,11 @@ _FOREIGN_MAPS = {
     **dict.fromkeys((".pcd", ".las", ".e57"), ("a point cloud", _FROM_A_LOG)),
     **dict.fromkeys((".obj", ".stl"), ("a mesh", _FROM_A_LOG)),
     ".bt": ("an OctoMap", _FROM_A_LOG),
+}
+_NO_MAPS = {
+    **dict.fromkeys(_PICTURES, ("a picture, no map", _MAP_HINT)),
+    **dict.fromkeys((".txt", ".csv", ".html", ".json", ".jsonl", ".yaml", ".yml", ".tum"), ("no map", _MAP_HINT)),
+    **dict.fromkeys(_FILES, ("a recording, no map", "map it first: splatbot map LOG")),
 }
 
 
@@ -176,7 +193,7 @@ def map_file(path: str | Path) -> Path:
     if not place.exists():
         hint = "check the path; give a map file, or a folder that `splatbot map` wrote"
         raise FormatError("does not exist.", file=place, field="map", hint=hint)
-    found = _foreign(place, _FOREIGN_MAPS)
+    found = None if place.name == _SOG_NAME else _foreign(place, _FOREIGN_MAPS | _NO_MAPS)
     if found is not None:
         raise FormatError(f"is {found[0]}.", file=place, field="map", hint=found[1])
     return place
@@ -193,6 +210,54 @@ def is_map(path: str | Path) -> bool:
 def is_tiled_map(path: str | Path) -> bool:
     """Return whether a path names the folder of a tiled map."""
     return (Path(path) / TILES_NAME).is_file()
+
+
+def check_run_folder(run: str | Path, field: str = "run") -> None:
+    """Check that a path is a folder, and not that of a training.
+
+    Raises:
+        FormatError: it is not.
+    """
+    place = Path(run)
+    if not place.exists():
+        raise FormatError("does not exist.", file=place, field=field, hint=_RUN_HINT)
+    if not place.is_dir():
+        what = "a map file" if is_map(place) else "a file"
+        raise FormatError(f"is {what}.", file=place, field=field, hint="give its run folder")
+    if (place / TRAINING_NAME).is_file():
+        hint = f"{_run_of_training(place)}; `splatbot train --resume {place}` continues the training"
+        raise FormatError("is a training, which has no recording.", file=place, field=field, hint=hint)
+
+
+def _run_of_training(folder: Path) -> str:
+    """Return the fix that names the run of a training; the settings of a damaged one do not name it."""
+    try:
+        dataset = Path(json.loads((folder / TRAINING_NAME).read_text(encoding="utf-8"))["dataset"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return "give the run of its log"
+    is_run = (dataset / "metrics.json").is_file()
+    return f"give the run of its log: {dataset}" if is_run else f"{_RUN_HINT}: this training is of photographs"
+
+
+def dataset_kind(folder: Path) -> DatasetKind:
+    """Return the kind of a dataset of `splatbot train` by the names of its files.
+
+    Raises:
+        InputError: the folder does not exist or is of no known kind.
+    """
+    if not folder.is_dir():
+        problem = "is no folder" if folder.exists() else "does not exist"
+        raise InputError(f"{problem}.", file=folder, field="dataset", hint=_DATASET_HINT)
+    if colmap_model(folder) is not None:
+        return "colmap"
+    if (folder / "transforms_train.json").is_file():
+        return "blender"
+    if (folder / "transforms.json").is_file():
+        return "nerfstudio"
+    if all((folder / name).is_file() for name in _DATASET_OF_RUN):
+        return "run"
+    check_run_folder(folder, "dataset")
+    raise InputError("holds no dataset of a known kind.", file=folder, field="dataset", hint=_DATASET_HINT)
 
 
 def _is_sog(folder: Path) -> bool:

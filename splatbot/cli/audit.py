@@ -8,6 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from splatbot.cli.paths import check_camera, check_run
+from splatbot.layouts import log_kind
+
 if TYPE_CHECKING:
     from splatbot.results.audit import RunAudit
 
@@ -37,6 +40,11 @@ def audit(
         n_sigma: surface of a Gaussian, in standard deviations.
         as_json: print JSON instead of tables.
     """
+    check_run(run)
+    if log is not None:
+        log_kind(log)
+    check_camera(camera)
+
     from splatbot.atomic import atomic_write
     from splatbot.report.audit import audit_png
     from splatbot.results.audit import audit_run

@@ -8,6 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from splatbot.cli.paths import check_camera, check_output
+from splatbot.layouts import log_kind
+
 if TYPE_CHECKING:
     from splatbot.calibration.estimate import Estimate
 
@@ -40,6 +43,10 @@ def calibrate_sensor_command(
         camera: intrinsics instead of the log's own: tum_fr1, tum_fr2, tum_fr3 or an intrinsics.json.
         quiet: no progress and no table, only errors.
     """
+    log_kind(log)
+    check_camera(camera)
+    check_output(out, folder=False)
+
     from splatbot.calibration.sensor import calibrate_sensor
     from splatbot.cli.tables import print_table
     from splatbot.errors import InputError

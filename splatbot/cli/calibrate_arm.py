@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from splatbot.cli.messages import print_message
+from splatbot.cli.paths import check_file, check_output, check_source
+from splatbot.cli.placing import named_robot
 
 if TYPE_CHECKING:
     from splatbot.calibration.hand_eye import HandEyeCalibration
@@ -54,15 +56,16 @@ def calibrate_intrinsics_command(
         max_views: largest number of images that are used, evenly spread.
         quiet: no progress and no table, only errors.
     """
+    check_source(views, "IMAGES|LOG")
+    check_output(out, folder=False)
+
     from splatbot.calibration.intrinsics import calibrate_intrinsics
     from splatbot.calibration.views import ViewSource
     from splatbot.cli.calibrate import describe
-    from splatbot.cli.paths import check_output
     from splatbot.cli.tables import print_table
     from splatbot.logs.base import MILLIMETRES
     from splatbot.logs.calibration import Calibration, save_calibration
 
-    check_output(out, folder=False)
     source = ViewSource(views)
     recording = _find_board(source, board, max_views, quiet)
     width, height = recording.size
@@ -132,17 +135,17 @@ def calibrate_hand_eye_command(
         out: scene.yaml to write; the fields of an existing one that this command estimates are replaced.
         quiet: no progress and no table, only errors.
     """
-    from splatbot.cli.placing import named_robot
-
+    check_source(source, "SOURCE")
+    check_file(joints, "--joints")
+    check_file(poses, "--poses")
+    check_output(out, folder=False)
     arm = None if robot is None else named_robot(robot)
 
     from splatbot.calibration.hand_eye import calibrate_hand_eye
-    from splatbot.cli.paths import check_output
     from splatbot.cli.progress import steps
     from splatbot.errors import InputError
     from splatbot.workspace import Workspace
 
-    check_output(out, folder=False)
     scene = Workspace.load(out) if out is not None and out.exists() else Workspace()
     names = scene.joint_names or (() if arm is None else tuple(arm.chain.names))
     if arm is not None and link is not None and abs(link) > len(arm.chain):

@@ -7,6 +7,10 @@ from typing import Annotated
 
 import tyro
 
+from splatbot.cli.paths import check_camera, check_file, check_output
+from splatbot.cli.placing import named_robot
+from splatbot.layouts import log_kind
+
 
 def calibrate_joint_delay_command(
     log: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="LOG")],
@@ -36,14 +40,15 @@ def calibrate_joint_delay_command(
         out: scene.yaml to write, with the estimate; by default only the table is printed.
         quiet: no progress and no table, only errors.
     """
-    from dataclasses import replace
-
-    from splatbot.cli.placing import named_robot
-
+    log_kind(log)
+    check_camera(camera)
+    check_file(scene, "--scene")
+    check_output(out, folder=False)
     arm = named_robot(robot)
 
+    from dataclasses import replace
+
     from splatbot.cli.calibrate import describe
-    from splatbot.cli.paths import check_camera, check_file, check_output
     from splatbot.cli.progress import shares
     from splatbot.cli.tables import print_table
     from splatbot.errors import InputError
@@ -51,9 +56,6 @@ def calibrate_joint_delay_command(
     from splatbot.robots.joint_delay import estimate_joint_delay
     from splatbot.workspace import Workspace, find_workspace
 
-    check_camera(camera)
-    check_file(scene, "--scene")
-    check_output(out, folder=False)
     workspace = Workspace.load(scene) if scene is not None else find_workspace(log) or Workspace()
     recording = open_log(log, camera=camera)
     with shares(quiet) as show:

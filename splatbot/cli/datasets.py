@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from splatbot.errors import InputError
+from splatbot.layouts import dataset_kind
 
 if TYPE_CHECKING:
     from splatbot.training.datasets import TrainingData
@@ -24,7 +25,7 @@ def open_training_data(folder: Path, scale: int, log: str | None = None) -> Trai
     """
     from splatbot.results.folder import RunFolder
     from splatbot.robots.in_view import reopen_log
-    from splatbot.training.datasets import dataset_kind, open_dataset
+    from splatbot.training.datasets import open_dataset
 
     if dataset_kind(folder) == "run":
         return open_dataset(folder, scale=scale, log=reopen_log(RunFolder(folder), uri=log))

@@ -186,9 +186,9 @@ def _check(
         raise InputError("is missing.", field="LOG", hint="name a recording: splatbot map LOG")
     if max_frames is not None and max_frames < 1:
         raise InputError(f"is {max_frames}.", field="--max-frames", hint="give at least 1")
-    for saved in (resume, localise):
+    for flag, saved in (("--resume", resume), ("--localise", localise)):
         if saved is not None:
-            check_state(saved)
+            check_state(saved, flag)
     if log and not is_camera(log):
         log_kind(log)
     if resume is None or (out is not None and out.resolve() != resume.resolve()):

@@ -10,7 +10,6 @@ import tyro
 
 from splatbot.cli.messages import print_message
 from splatbot.cli.paths import check_output, check_state
-from splatbot.errors import FormatError
 from splatbot.results.merge_output import check_merge, draft_of, restore_run
 
 if TYPE_CHECKING:
@@ -84,12 +83,10 @@ def check_runs(a: Path, b: Path) -> None:
     """Check that both paths are folders of runs with a saved state.
 
     Raises:
-        FormatError: one is a file, or has no saved state.
+        FormatError: one is no run, or has no saved state.
     """
-    for name, run in (("A", a), ("B", b)):
-        if run.is_file():
-            raise FormatError("is a map file.", file=run, field=name, hint="give its run folder")
-        check_state(run)
+    check_state(a, "A")
+    check_state(b, "B")
 
 
 def pose_rows(alignment: MapAlignment) -> list[tuple[str, str]]:

@@ -8,6 +8,7 @@ import tempfile
 from pathlib import Path
 
 from splatbot.errors import FormatError, InputError
+from splatbot.layouts import RECORDING, TRAINING_NAME, check_run_folder
 
 _FIXES = {
     errno.ENOSPC: "free some space, or write to another disk",
@@ -83,34 +84,55 @@ def check_new(path: Path, *, overwrite: bool) -> None:
         raise InputError("exists already.", file=path, field="--out", hint="name another one, or give --overwrite")
 
 
-def check_run(run: Path) -> None:
+def check_run(run: Path, field: str = "run") -> None:
     """Check that a path is a folder of a run.
 
     Raises:
         FormatError: it is not.
     """
-    hint = "give a folder that `splatbot map` wrote"
-    if not run.is_dir():
-        raise FormatError("is a file." if run.exists() else "does not exist.", file=run, field="run", hint=hint)
+    check_run_folder(run, field)
     if not (run / "metrics.json").is_file():
-        raise FormatError("is no folder of a run: it has no metrics.json.", file=run, field="run", hint=hint)
+        hint = "give a folder that `splatbot map` wrote"
+        raise FormatError("is no folder of a run: it has no metrics.json.", file=run, field=field, hint=hint)
 
 
-def check_state(run: Path) -> None:
+def check_state(run: Path, field: str = "run") -> None:
     """Check that a run has a saved state, to continue it or to localise in it.
 
     Raises:
         FormatError: it has none.
     """
+    check_run_folder(run, field)
     state = run / "state" / "run.state"
     if state.is_file():
         return
-    if not run.is_dir():
-        why, hint = "the folder does not exist", "give a folder that `splatbot map` wrote"
-    else:
-        why = "the run ended before its first save (--save-every, 30 s), or was mapped with --save-every 0"
-        hint = f"map the log again: splatbot map LOG --out {run} --overwrite --save-every 10"
+    if any(run.iterdir()) and not (run / RECORDING).is_file():
+        check_run(run, field)
+    why = "the run ended before its first save (--save-every, 30 s), or was mapped with --save-every 0"
+    hint = f"map the log again: splatbot map LOG --out {run} --overwrite --save-every 10"
     raise FormatError(f"there is no saved state: {why}.", file=state, hint=hint)
+
+
+def check_training(folder: Path, field: str) -> None:
+    """Check that a path is a folder of a training.
+
+    Raises:
+        FormatError: it is not.
+    """
+    if not (folder / TRAINING_NAME).is_file():
+        problem = "holds no training" if folder.is_dir() else "is no folder" if folder.exists() else "does not exist"
+        hint = "give a folder that `splatbot train` wrote"
+        raise FormatError(f"{problem}.", file=folder, field=field, hint=hint)
+
+
+def check_source(source: str, field: str) -> None:
+    """Check that a folder of images, a log or a file exists.
+
+    Raises:
+        InputError: it does not.
+    """
+    if not source.startswith("synthetic:") and not any(Path(it).exists() for it in (source, source.partition("?")[0])):
+        raise InputError("does not exist.", file=source, field=field, hint="check the path")
 
 
 def check_camera(camera: str | None) -> None:

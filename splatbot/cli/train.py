@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from splatbot.cli.paths import check_output
+from splatbot.cli.paths import check_output, check_training
 from splatbot.errors import InputError
-from splatbot.layouts import MAP_NAME
+from splatbot.layouts import MAP_NAME, dataset_kind, log_kind
 
 if TYPE_CHECKING:
     from splatbot.gaussians import GaussianModel
@@ -120,6 +120,12 @@ def train(
         raise InputError("is missing.", field="DATASET", hint="name a folder of photographs, or --resume a training")
     if not checkpoint_every > 0:
         raise InputError(f"is {checkpoint_every:g}.", field="--checkpoint-every", hint="give seconds above 0")
+    if resume is not None:
+        check_training(resume, "--resume")
+    if dataset is not None:
+        dataset_kind(dataset)
+    if log is not None:
+        log_kind(log)
     check_output(out)
     port = _viewer_port(viewer)
 

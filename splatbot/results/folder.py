@@ -18,6 +18,7 @@ from splatbot.config import Config, load_config
 from splatbot.errors import FormatError, InputError
 from splatbot.formats.ply import save_ply
 from splatbot.gaussians import GaussianModel
+from splatbot.layouts import check_run_folder
 from splatbot.trajectory import Trajectory
 
 _NOT_A_RUN = "give a folder that `splatbot map` wrote"
@@ -298,6 +299,7 @@ class RunFolder:
 
     def _require(self, path: Path) -> Path:
         if not path.is_file():
+            check_run_folder(self.path)
             raise FormatError("is missing.", file=path, hint=_NOT_A_RUN)
         check_file(path)
         return path

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from splatbot.config import MappingConfig
 from splatbot.errors import InputError
+from splatbot.layouts import DatasetKind
 from splatbot.optimize.strategies import DefaultStrategy, MCMCStrategy, Strategy
-from splatbot.training.datasets.base import DatasetKind
 
 USUAL: Mapping[DatasetKind, Mapping[str, Any]] = {
     "run": {

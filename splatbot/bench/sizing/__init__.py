@@ -12,7 +12,7 @@ from tyro.conf import Suppress, arg
 
 from splatbot.bench.benchmark import Benchmark, ReportProgress, Settings
 from splatbot.bench.results import Results
-from splatbot.bench.sizing.costs import is_measured
+from splatbot.bench.sizing.costs import is_measured, read_costs
 from splatbot.bench.tables import Table, cases, per_metric
 from splatbot.errors import InputError
 
@@ -83,7 +83,7 @@ class SizingSettings(Settings):
     simulated: Suppress[int] = 200_000
 
     def validate(self) -> None:
-        """Raise an InputError for a value out of range."""
+        """Raise an InputError for a value out of range, or for a file without costs."""
         for name in ("gaussians", "robots", "stay", "cores", "memory", "disk", "read"):
             if not 0 < getattr(self, name) <= 1e15:
                 raise InputError(f"is {getattr(self, name)}.", field=f"--{name}", hint="give a positive number")
@@ -99,6 +99,8 @@ class SizingSettings(Settings):
             raise InputError(f"is {self.shard}.", field="--shard", hint="give at most 5e7, the largest tiled map")
         gigabits(self.link, "--link")
         gigabits(self.balancer, "--balancer")
+        if self.costs is not None:
+            read_costs(self.costs)
 
 
 def gigabits(text: str, field: str) -> float:

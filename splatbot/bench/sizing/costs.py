@@ -116,6 +116,12 @@ def read_measurement(file: Path) -> Results:
     return results
 
 
+def read_costs(file: Path) -> tuple[Results, Costs]:
+    """Read the measurement of an earlier run, see :func:`read_measurement`, and its costs."""
+    results = read_measurement(file)
+    return results, Costs.of_rows(results.rows, file)
+
+
 def is_measured(row: Row) -> bool:
     """Return whether a row is measured, and not of the plan or of its simulation."""
     return not row.case.startswith(("plan:", "simulated "))

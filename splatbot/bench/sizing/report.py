@@ -12,7 +12,7 @@ from splatbot.bench.benchmark import ReportProgress
 from splatbot.bench.machine import describe_machine
 from splatbot.bench.results import Results
 from splatbot.bench.sizing import SizingSettings, gigabits
-from splatbot.bench.sizing.costs import COLLISIONS, DISTANCE, FRAME, PLACE, PLAN, Costs, read_measurement
+from splatbot.bench.sizing.costs import COLLISIONS, DISTANCE, FRAME, PLACE, PLAN, Costs, read_costs
 from splatbot.bench.sizing.fleet import Fleet, FleetPlan, most_robots, plan_fleet, utilisation
 from splatbot.bench.sizing.measuring import measure_costs
 from splatbot.bench.sizing.queueing import RequestStream, SimulatedNode, simulate_node
@@ -24,8 +24,7 @@ _CURVE = np.geomspace(0.01, 4.0, 60)
 def run_sizing(settings: SizingSettings, report_progress: ReportProgress) -> Results:
     """Measure or read the costs, plan the fleet of the settings, and simulate one of its nodes."""
     if settings.costs:
-        results = read_measurement(settings.costs)
-        costs = Costs.of_rows(results.rows, settings.costs)
+        results, costs = read_costs(settings.costs)
     else:
         results = Results(describe_machine((1,), peak_ms=settings.peak_ms))
         costs = measure_costs(settings, results, report_progress)

@@ -5,14 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 from splatbot.errors import InputError
+from splatbot.layouts import dataset_kind
 from splatbot.logs import Log
 from splatbot.training.datasets.base import TrainingData, TrainingView
 from splatbot.training.datasets.colmap import colmap_dataset
-from splatbot.training.datasets.kind import dataset_kind
 from splatbot.training.datasets.run import open_run_log, run_dataset
 from splatbot.training.datasets.transforms import blender_dataset, nerfstudio_dataset
 
-__all__ = ["TrainingData", "TrainingView", "dataset_kind", "open_dataset"]
+__all__ = ["TrainingData", "TrainingView", "open_dataset"]
 
 
 def open_dataset(folder: Path, *, scale: int = 1, log: Log | None = None) -> TrainingData:

@@ -6,15 +6,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from splatbot.camera import Camera
 from splatbot.errors import FormatError, InputError
-
-DatasetKind = Literal["colmap", "blender", "nerfstudio", "run"]
+from splatbot.layouts import DatasetKind
 
 _EXTENT_FACTOR = 1.1  # of Kerbl et al. 2023
 _LEAST_EXTENT = 1e-3  # of a single camera

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -17,47 +18,90 @@ from tests.unit.cli.conftest import RunCommand, assert_refused
 HEAVY = ("torch", "open3d", "cv2", "matplotlib", "mujoco", "fastapi", "numpy", "rosbags")
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["map", "{no}", "--out", "{out}"],
-        ["map", "{no}.mcap", "--out", "{out}"],
-        ["map", "{zip}", "--out", "{out}"],
-        ["map", "{log}", "--out", "{file}"],
-        ["map", "{log}", "--camera", "{no}.json", "--out", "{out}"],
-        ["map", "--resume", "{no}", "--out", "{out}"],
-        ["map", "{log}", "--localise", "{no}", "--out", "{out}"],
-        ["map", "{log}", "--config", "{no}", "--out", "{out}"],
-        ["eval", "{no}"],
-        ["render", "{no}", "--out", "{out}"],
-        ["render", "{log}", "--out", "{out}"],
-        ["info", "{no}"],
-        ["simulate", "tabletop", "--out", "{file}/in/it"],
-        ["record", "{no}", "--out", "{out}"],
-        ["record", "{log}", "--out", "{file}"],
-        ["serve", "--map", "{no}"],
-        ["serve", "--log", "{no}"],
-        ["view", "{no}"],
-        ["plan", "--map", "{no}", "--start", "home", "--goal", "home", "--out", "{out}"],
-        ["grasp", "--map", "{no}", "--target", "box", "--out", "{out}"],
-        ["twin", "--map", "{no}", "--json", "{out}"],
-        ["sim2real", "{no}", "--map", "{no}", "--out", "{out}"],
-    ],
-)
-def test_a_wrong_path_is_refused_before_libraries_load_and_folders_appear(
-    tmp_path: Path, make_names: dict[str, str], words: list[str]
+WRONG = [
+    ["map", "{no}", "--out", "{out}"],
+    ["map", "{no}.mcap", "--out", "{out}"],
+    ["map", "{zip}", "--out", "{out}"],
+    ["map", "{log}", "--out", "{file}"],
+    ["map", "{log}", "--camera", "{no}.json", "--out", "{out}"],
+    ["map", "--resume", "{no}", "--out", "{out}"],
+    ["map", "{log}", "--localise", "{no}", "--out", "{out}"],
+    ["map", "{log}", "--config", "{no}", "--out", "{out}"],
+    ["eval", "{no}"],
+    ["render", "{no}", "--out", "{out}"],
+    ["render", "{log}", "--out", "{out}"],
+    ["info", "{no}"],
+    ["simulate", "tabletop", "--out", "{file}/in/it"],
+    ["record", "{no}", "--out", "{out}"],
+    ["record", "{log}", "--out", "{file}"],
+    ["serve", "--map", "{no}"],
+    ["serve", "--log", "{no}"],
+    ["view", "{no}"],
+    ["plan", "--map", "{no}", "--start", "home", "--goal", "home", "--out", "{out}"],
+    ["grasp", "--map", "{no}", "--target", "box", "--out", "{out}"],
+    ["twin", "--map", "{no}", "--json", "{out}"],
+    ["sim2real", "{no}", "--map", "{no}", "--out", "{out}"],
+    ["audit", "{no}"],
+    ["audit", "{run}/map.ply"],
+    ["audit", "{training}"],
+    ["audit", "{run}", "--log", "{no}"],
+    ["eval", "{file}"],
+    ["merge", "{run}", "{training}", "--out", "{out}"],
+    ["merge", "{no}", "{run}", "--out", "{out}"],
+    ["diff", "{training}", "{run}"],
+    ["map", "--resume", "{training}"],
+    ["map", "{log}", "--localise", "{training}", "--out", "{out}"],
+    ["sim2real", "{log}", "--map", "{training}", "--out", "{out}"],
+    ["train", "{no}"],
+    ["train", "{training}"],
+    ["train", "{run}", "--log", "{no}"],
+    ["train", "--resume", "{run}"],
+    ["objects", "{no}"],
+    ["objects", "{picture}"],
+    ["objects", "{training}/training.json"],
+    ["info", "{picture}"],
+    ["compare", "{no}", "{no}"],
+    ["export", "{no}"],
+    ["convert", "{no}", "{out}.ply"],
+    ["compact", "{no}"],
+    ["tile", "{no}", "--out", "{out}"],
+    ["plan-pick", "--map", "{no}", "--grasp", "{no}"],
+    ["convert-log", "{no}", "{out}"],
+    ["prepare", "{no}", "--out", "{out}"],
+    ["calibrate", "sensor", "{no}"],
+    ["calibrate", "intrinsics", "{no}", "--board", "charuco:10x14:0.07:0.04"],
+    ["calibrate", "hand-eye", "{no}", "--robot", "panda"],
+    ["calibrate", "joint-delay", "{no}", "--robot", "panda"],
+    ["bench", "sizing", "--costs", "{no}", "--out", "{out}"],
+    ["bench", "sizing", "--costs", "{training}/training.json", "--out", "{out}"],
+]
+"""Commands with a wrong path."""
+
+PROGRAM = """
+import contextlib, io, json, sys
+from splatbot.cli import main
+
+for words in json.loads(sys.argv[1]):
+    with contextlib.redirect_stderr(io.StringIO()) as errors:
+        code = main(words)
+    heavy = [name for name in sys.argv[2:] if name in sys.modules]
+    print(json.dumps({"words": words, "code": code, "heavy": heavy, "errors": errors.getvalue()}))
+"""
+
+
+def test_each_wrong_path_is_refused_before_libraries_load_and_folders_appear(
+    tmp_path: Path, make_names: dict[str, str]
 ) -> None:
-    given = [word.format(**make_names) for word in words]
-    program = (
-        "import sys\nfrom splatbot.cli import main\n"
-        f"code = main({given!r})\n"
-        f"print('HEAVY', code, [m for m in {HEAVY!r} if m in sys.modules])"
-    )
+    given = [[word.format(**make_names) for word in words] for words in WRONG]
     before = sorted(tmp_path.rglob("*"))
-    answer = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=120)
-    assert answer.stdout.splitlines()[-1] == "HEAVY 2 []"
-    assert answer.stderr.startswith("error: ")
-    assert " Fix: " in answer.stderr
+    words = [sys.executable, "-c", PROGRAM, json.dumps(given), *HEAVY]
+    answer = subprocess.run(words, capture_output=True, text=True, check=True, timeout=300)
+    refusals = [json.loads(line) for line in answer.stdout.splitlines()]
+    assert [refusal["words"] for refusal in refusals] == given
+    for refusal in refusals:
+        assert (refusal["code"], refusal["heavy"]) == (2, []), refusal
+        assert refusal["errors"].startswith("error: "), refusal
+        assert " Fix: " in refusal["errors"], refusal
     assert sorted(tmp_path.rglob("*")) == before
 
 
@@ -67,10 +111,46 @@ def make_names(tmp_path: Path) -> dict[str, str]:
     log = tmp_path / "log"
     log.mkdir()
     (log / "rgb.txt").touch()
-    for name in ("recording.zip", "file"):
+    for name in ("recording.zip", "file", "first.png"):
         (tmp_path / name).touch()
+    for name in ("map.ply", "trajectory.tum", "config.yaml", "metrics.json", "state/run.state"):
+        (tmp_path / "run" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "run" / name).touch()
+    training = tmp_path / "training"
+    training.mkdir()
+    for name in ("map.ply", "trajectory.tum"):
+        (training / name).touch()
+    (training / "training.json").write_text(json.dumps({"dataset": str(tmp_path / "run")}))
     names = {"no": "missing", "log": "log", "zip": "recording.zip", "file": "file", "out": "out"}
+    names |= {"run": "run", "training": "training", "picture": "first.png"}
     return {key: str(tmp_path / name) for key, name in names.items()}
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["merge", "{run}", "{training}", "--out", "{out}"],
+        ["diff", "{training}", "{run}"],
+        ["audit", "{training}"],
+        ["map", "--resume", "{training}"],
+        ["train", "{training}"],
+    ],
+)
+def test_a_training_in_place_of_a_run_is_named_with_its_run_and_no_advice_replaces_it(
+    run: RunCommand, make_names: dict[str, str], words: list[str]
+) -> None:
+    answer = run(*(word.format(**make_names) for word in words))
+    assert_refused(answer, "is a training")
+    assert f"give the run of its log: {make_names['run']};" in answer.err
+    assert "--overwrite" not in answer.err
+
+
+@pytest.mark.parametrize(
+    ("name", "words"), [("a.png", "a picture, no map"), ("a.mcap", "a recording, no map"), ("a.yaml", "no map")]
+)
+def test_a_file_that_is_no_map_is_named(run: RunCommand, tmp_path: Path, name: str, words: str) -> None:
+    (tmp_path / name).touch()
+    assert_refused(run("objects", tmp_path / name), f"is {words}. Fix: ")
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,8 @@ import pytest
 
 from splatbot.camera import Camera
 from splatbot.errors import InputError
+from splatbot.layouts import dataset_kind
 from splatbot.training.datasets import TrainingData, TrainingView, open_dataset
-from splatbot.training.datasets.kind import dataset_kind
 from tests.unit.training.datasets.scenes import transforms_scene
 
 
