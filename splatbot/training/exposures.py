@@ -17,8 +17,8 @@ class ExposureTransforms:
     mean over the photographs.
 
     Each photograph counts its own steps of Adam, with the rates of the release of 3D Gaussian splatting (Kerbl et al.
-    2024). There, Adam steps all photographs at once, mostly with a gradient of 0. A view then moves about √C times as far,
-    which follows its errors into colours that other views do not have.
+    2024). There, Adam steps all photographs at once, mostly with a gradient of 0. A view then moves about √C times as
+    far, which follows its errors into colours that other views do not have.
 
     Args:
         count: C, the number of photographs.
