@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import Any
 
@@ -53,11 +53,25 @@ class MinimumClearance:
     other: str = ""
 
 
-class ContactMonitor:
-    """Records contacts of the arm."""
+Expected = Callable[[str, str, float, float], bool]
+"""Returns whether a contact is part of the task; takes the part of the arm, the other body, depth [m] and time [s]."""
 
-    def __init__(self, world: World) -> None:
-        self._world = world
+
+def expect_none(part: str, other: str, depth: float, time: float) -> bool:
+    """Expect no contact."""
+    return False
+
+
+class ContactMonitor:
+    """Records contacts of the arm.
+
+    Args:
+        world: the scene.
+        expected: contacts that are not recorded, as those of fingers with the object that they grasp.
+    """
+
+    def __init__(self, world: World, *, expected: Expected = expect_none) -> None:
+        self._world, self._expected = world, expected
         self._found: dict[tuple[str, str], ContactEvent] = {}
         self._force = np.zeros(6)
         self.tangential = 0.0
@@ -76,10 +90,13 @@ class ContactMonitor:
             arm_a, arm_b = a >= 0 and self._world.of_robot[a], b >= 0 and self._world.of_robot[b]
             if arm_a or arm_b:
                 first, second = (a, b) if arm_a else (b, a)
-                self._note(self._name(first), self._name(second), time, -float(data.contact.dist[i]))
-
-    def _name(self, geom: int) -> str:
-        return self._world.owner[geom] if geom >= 0 else "soft body"
+                part, other, depth = (
+                    self._world.name_of(first),
+                    self._world.name_of(second),
+                    -float(data.contact.dist[i]),
+                )
+                if not self._expected(part, other, depth, time):
+                    self._note(part, other, time, depth)
 
     def _note(self, part: str, other: str, time: float, depth: float) -> None:
         force = float(self._force[0])

@@ -97,6 +97,13 @@ class MapPick:
             found.append(f"the target rose by {1e3 * self.rose:.0f} mm of {1e3 * self.wanted:.0f} mm")
         return tuple(found)
 
+    @property
+    def outcome(self) -> str:
+        """Return the verdict on the whole pick in words: that of the pick, or that of physics after it."""
+        if not self.result or not self.problems:
+            return str(self.result.outcome)
+        return "touched" if self.contacts else "not lifted"
+
     def __bool__(self) -> bool:
         return not self.problems
 
@@ -176,7 +183,7 @@ def pick_on_map(
         result,
         float(body.xipos[2]) - before,
         options.lift,
-        monitor.unintended(),
+        tuple(monitor.contacts.found),
         monitor.clearance.minimum,
         monitor.recording,
         twin.world.notes,
@@ -187,18 +194,16 @@ class _Monitor:
     """Records contacts, clearance and poses in every control period."""
 
     def __init__(self, twin: Twin, further: Callable[[Any, float], None] | None) -> None:
-        self.contacts = ContactMonitor(twin.world)
-        self.clearance = ClearanceMonitor(twin.world, without=hand_parts(twin.world))
-        self.recording, self._further = TwinRecording(twin.world), further
+        self._hand = hand_parts(twin.world)
+        self.contacts = ContactMonitor(twin.world, expected=self._expected)
+        self.clearance = ClearanceMonitor(twin.world, without=self._hand)
+        self.recording, self._further = TwinRecording(twin.world, expected=self._expected), further
         self._due = self.time = 0.0
         self.closing = np.inf
-        self._early: dict[str, float] = {}
 
     def __call__(self, data: Any, time: float) -> None:
         self.time = time
         self.contacts.update(data, time)
-        if time <= self.closing:
-            self._early = {c.part: c.depth for c in self.contacts.found if c.other == TARGET}
         if time >= self._due:
             self.clearance.update(data, time)
             self._due = time + CONSTANTS.clearance_period
@@ -206,15 +211,9 @@ class _Monitor:
         if self._further is not None:
             self._further(data, time)
 
-    def unintended(self) -> tuple[ContactEvent, ...]:
-        """Return the contacts of the arm, without those of the hand with the target from the closing on."""
-        hand = hand_parts(self.recording.world)
-        return tuple(
-            contact
-            for contact in self.contacts.found
-            if not (contact.other == TARGET and contact.part in hand)
-            or (contact.first < self.closing and self._early.get(contact.part, 0.0) > CONSTANTS.shape_error)
-        )
+    def _expected(self, part: str, other: str, depth: float, time: float) -> bool:
+        """Expect the hand to touch the target: from the closing on, or before it within the error of its shape."""
+        return other == TARGET and part in self._hand and (time > self.closing or depth <= CONSTANTS.shape_error)
 
 
 def hand_parts(world: World) -> frozenset[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -46,7 +47,8 @@ class TwinPageConstants:
 
 
 CONSTANTS = TwinPageConstants()
-_ROBOT, _PATH, _CONTACT = (0.75, 0.76, 0.79), (0.2, 0.75, 0.85), (1.0, 0.24, 0.24)
+_ROBOT, _PATH, _CONTACT, _GRIP = (0.75, 0.76, 0.79), (0.2, 0.75, 0.85), (1.0, 0.24, 0.24), (0.65, 0.35, 0.95)
+_RISE = (0.95, 0.5, 0.1)
 
 
 def twin_html(recording: TwinRecording, result: TwinResult) -> str:
@@ -55,7 +57,9 @@ def twin_html(recording: TwinRecording, result: TwinResult) -> str:
 
 
 def recording_html(recording: TwinRecording, *, title: str, facts: str, target: str = "") -> str:
-    """Return the page: robot, objects and map as points, contacts, and a curve of the arm's clearance over time.
+    """Return the page: robot, objects and map as points, contacts, and curves over time.
+
+    The curves are the clearance of the arm, and the height by which the target rose.
 
     Args:
         recording: of the run.
@@ -75,12 +79,17 @@ def recording_html(recording: TwinRecording, *, title: str, facts: str, target: 
         "normals": packed(np.rint(127 * normals), np.int8),
         "tints": packed(bytes_of(tints), np.uint8),
         "path": packed(path, np.float32),
-        "pathColor": [round(255 * part) for part in _PATH],
+        "pathColor": _bytes(_PATH),
         "body": packed(body, np.uint16),
         "bodies": int(world.model.nbody),
         "poses": packed(recording.poses, np.float32),
         "soft": packed(recording.soft, np.float32),
-        "contacts": [[[round(v, 4) for v in contact] for contact in found] for found in recording.contacts],
+        "contacts": _rounded(recording.contacts),
+        "grips": _rounded(recording.grips),
+        "contactColor": _bytes(_CONTACT),
+        "gripColor": _bytes(_GRIP),
+        "rises": np.round(recording.rise(target), 5).tolist() if target else [],
+        "riseColor": css(_RISE),
         "clearances": np.round(recording.clearances, 5).tolist(),
         "far": FAR,
         "times": np.round(recording.times, 4).tolist(),
@@ -89,11 +98,20 @@ def recording_html(recording: TwinRecording, *, title: str, facts: str, target: 
         "yaw": CONSTANTS.yaw,
         "size": CONSTANTS.point_size,
     }
-    return moving_page(title, facts, document, "twin_view.js", legend=_legend(world, target), curve=True)
+    return moving_page(title, facts, document, "twin_view.js", legend=_legend(recording, target), curve=True)
 
 
-def _legend(world: World, target: str) -> list[tuple[str, str]]:
+def _rounded(contacts: Sequence[Sequence[Sequence[float]]]) -> list[list[list[float]]]:
+    return [[[round(value, 4) for value in contact] for contact in found] for found in contacts]
+
+
+def _bytes(color: Sequence[float]) -> list[int]:
+    return [round(255 * part) for part in color]
+
+
+def _legend(recording: TwinRecording, target: str) -> list[tuple[str, str]]:
     """Return the name and the CSS colour of each part that the page draws."""
+    world = recording.world
     rows = [] if world.parts is None else [MAP_IN_COLORS]
     if world.robot is not None:
         rows.append(("arm and hand: their collision shapes, larger than the real ones", css(_ROBOT)))
@@ -101,8 +119,13 @@ def _legend(world: World, target: str) -> list[tuple[str, str]]:
     for obj in world.scene.objects:
         if obj.movable or obj.path:
             rows.append((f"{obj.name}: its completed surface" if obj.name == target else obj.name, css(obj.color)))
-    rows.append(("contact of the arm; in the curve its time", css(_CONTACT)))
+    if any(recording.contacts):
+        rows.append(("contact of the arm; in the curve its time", css(_CONTACT)))
+    if any(recording.grips):
+        rows.append(("contact of the hand with the target, as expected", css(_GRIP)))
     rows.append(("clearance of the arm", "var(--curve)"))
+    if target:
+        rows.append(("rise of the target, in the curve", css(_RISE)))
     return rows
 
 

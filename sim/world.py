@@ -87,6 +87,10 @@ class World:
         """Names of the active effects."""
         return tuple(d.name for d in self.decisions if d.on)
 
+    def name_of(self, geom: int) -> str:
+        """Return the name of the link, finger, object or map that a geom of a contact belongs to; -1 is a soft body."""
+        return self.owner[geom] if geom >= 0 else "soft body"
+
     @property
     def harmonics(self) -> int:
         """Spherical harmonics degree at which a camera renders the map."""

@@ -185,8 +185,8 @@ def _summary(picked: MapPick, known: GraspFile) -> dict[str, Any]:
         "arm_margin_m": known.arm_margin,
         "grasp_width_m": None if result.grasp is None else result.grasp.width,
         "simulated": {
-            "outcome": result.outcome,
-            "reason": result.reason,
+            "outcome": picked.outcome,
+            "reason": "; ".join(picked.problems),
             "rose_m": picked.rose,
             "contacts": [asdict(contact) for contact in picked.contacts],
             "clearance": asdict(picked.clearance),

@@ -32,13 +32,13 @@ def moving_page(
             ``yaw`` [rad].
         script: file in this folder that draws one time step; see ``stage.js``.
         legend: name and CSS colour of each part that is drawn.
-        curve: add a canvas for a clearance curve below the view.
+        curve: add a canvas for curves over time below the view.
         toggle: label of a checkbox, which the script reads.
     """
     folder = resources.files("splatbot.report")
     own, stage = (folder.joinpath(name).read_text(encoding="utf-8") for name in (script, "stage.js"))
     parts = "".join(f'<li><i style="background: {color}"></i>{html.escape(name)}</li>' for name, color in legend)
-    chart = '<canvas id="curve" title="clearance of the arm; red: contact"></canvas>\n' if curve else ""
+    chart = '<canvas id="curve" title="click a moment"></canvas>\n' if curve else ""
     box = f'<label><input id="toggle" type="checkbox"> {html.escape(toggle)}</label>\n' if toggle else ""
     return f"""<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><title>{html.escape(title)}</title>
@@ -51,7 +51,7 @@ header, footer {{ padding: 8px 14px; overflow-wrap: anywhere; }}
 #legend {{ display: flex; flex-wrap: wrap; gap: 2px 16px; margin: 0; padding: 0 14px 6px; list-style: none; }}
 #legend i {{ display: inline-block; width: 12px; height: 12px; margin-right: 6px; border-radius: 3px; }}
 #view {{ flex: 1; min-height: 0; width: 100vw; display: block; touch-action: none; }}
-#curve {{ height: 90px; width: calc(100vw - 28px); margin: 0 14px; cursor: pointer; }}
+#curve {{ height: 120px; width: calc(100vw - 28px); margin: 0 14px; cursor: pointer; }}
 footer {{ display: flex; flex-wrap: wrap; gap: 12px; align-items: center; }}
 input[type="range"] {{ flex: 1; min-width: 8em; }} #play {{ width: 5em; }}
 </style></head><body>

@@ -19,6 +19,7 @@ from splatbot.workspace import Workspace
 from tests.unit.cli.conftest import RunCommand, assert_fix_named, assert_refused
 from tests.unit.grasping.files import grasp_file_values
 from tests.unit.grasping.objects import OBJECTS, model
+from tests.unit.sim.test_page import document
 
 pytest.importorskip("mujoco")
 
@@ -52,6 +53,11 @@ def test_the_box_is_held_in_the_twin_and_each_motion_clears_the_true_objects(
     assert written["execute"]
     assert written["simulated"]["rose_m"] == pytest.approx(0.15, abs=0.01)
     assert not written["simulated"]["contacts"]
+    assert (written["simulated"]["outcome"], written["simulated"]["reason"]) == ("picked", "")
+    drawn = document((out / "pick.html").read_text())
+    assert not any(drawn["contacts"])  # as in pick.json
+    assert any(drawn["grips"])
+    assert drawn["rises"][-1] == pytest.approx(written["simulated"]["rose_m"], abs=0.005)
     stages = [motion["stage"] for motion in written["motions"]]
     assert stages == ["move", "approach", "lift", "lift"]
     assert all(motion["certified"] for motion in written["motions"])
@@ -93,6 +99,8 @@ def test_a_pick_that_the_twin_does_not_hold_is_not_to_be_executed(
     assert_refused(answer, "should not be executed: nothing held")
     written = json.loads((out / "pick.json").read_text())
     assert not written["execute"]
+    assert written["simulated"]["outcome"] == "nothing held"
+    assert written["simulated"]["reason"] == "; ".join(written["problems"])
     files = {path.name for path in out.glob("[0-9]*")}
     assert files == {motion["file"] for motion in written["motions"]} == {"1-move.json", "2-approach.json"}
 

@@ -7,8 +7,11 @@ import numpy as np
 import pytest
 
 from splatbot.geometry import quat_to_rotation
+from splatbot.grasping.pick_types import PickOutcome, PickResult, PickStage
 from splatbot.protocols import Array
-from splatbot.sim.map_pick import CONSTANTS, TARGET, _HeldStill, solid_shell
+from splatbot.sim.contact_monitor import ContactEvent, MinimumClearance
+from splatbot.sim.map_pick import CONSTANTS, TARGET, MapPick, _HeldStill, solid_shell
+from splatbot.sim.recording import TwinRecording
 from splatbot.sim.scene import make_scene
 from splatbot.sim.twin import Twin
 
@@ -64,3 +67,25 @@ def test_a_target_stands_on_its_edge_until_it_is_released() -> None:
     held.release()
     mujoco.mj_step(twin.world.model, twin.data, 500)
     assert before[2] - body.xpos[2] > 0.02  # it lies
+
+
+_TOUCH = ContactEvent("forearm", "map", 1.0, 1.2, 0.002, 3.0)
+
+
+@pytest.mark.parametrize(
+    ("outcome", "rose", "contacts", "verdict"),
+    [
+        (PickOutcome.PICKED, 0.15, (), "picked"),
+        (PickOutcome.PICKED, 0.072, (), "not lifted"),
+        (PickOutcome.PICKED, 0.15, (_TOUCH,), "touched"),
+        (PickOutcome.NOTHING_HELD, 0.0, (), "nothing held"),
+    ],
+)
+def test_the_outcome_is_picked_only_without_a_problem(
+    outcome: PickOutcome, rose: float, contacts: tuple[ContactEvent, ...], verdict: str
+) -> None:
+    scene = make_scene({"name": "empty", "objects": [{"name": "table", "shapes": [{"kind": "plane"}]}]})
+    result = PickResult(outcome, PickStage.CHECK, "", None, ())
+    pick = MapPick(result, rose, 0.15, contacts, MinimumClearance(0.3, 0.0), TwinRecording(Twin(scene).world), ())
+    assert pick.outcome == verdict
+    assert bool(pick) == (verdict == "picked") == (not pick.problems)

@@ -79,6 +79,30 @@ def test_the_recording_has_the_contacts_and_clearance_of_the_run() -> None:
     assert max(force for found in recording.contacts for *_, force in found) <= max(t.force for t in result.contacts)
 
 
+def test_expected_contacts_are_apart_from_those_of_the_arm_and_the_curve_shows_the_rise_in_height() -> None:
+    """The mug hangs on the hand; all of its contacts are expected, and those of other bodies are not."""
+    whole, _ = recorded()
+    twin = Twin(load_scene("mug_hanging"))
+    recording = TwinRecording(twin.world, expected=lambda part, other, depth, time: other == "mug")
+    body, heights = twin.data.body("object/mug"), []
+
+    def watch(data: Any, time: float) -> None:
+        before = len(recording.times)
+        recording(data, time)
+        if len(recording.times) > before:
+            heights.append(float(body.xipos[2]))
+
+    twin.follow(watch=watch)
+    assert any(recording.grips)
+    for all_, rest, grips in zip(whole.contacts, recording.contacts, recording.grips, strict=True):
+        assert sorted(all_) == sorted([*rest, *grips])
+    page = recording_html(recording, title="x", facts="", target="mug")
+    assert document(page)["grips"] != document(page)["contacts"]
+    np.testing.assert_allclose(document(page)["rises"], np.array(heights) - heights[0], atol=1e-5)
+    assert "rise of the target" in page
+    assert ("contact of the arm; in the curve its time" in page) == any(recording.contacts)
+
+
 def test_the_pages_bodies_are_where_mujocos_geoms_are() -> None:
     recording, result = recorded()
     values = document(twin_html(recording, result))
