@@ -70,12 +70,14 @@ def _eval_training(folder: Path, *, log: str | None, as_json: bool) -> int:
     from splatbot.results.units import decibels, number
     from splatbot.training.folder import TrainingFolder
     from splatbot.training.images import ImageCache
+    from splatbot.training.intrinsics import with_refined
     from splatbot.training.scoring import score_held_out, summary
 
     training = TrainingFolder(folder)
     settings = training.load_settings()
     data = open_training_data(settings.dataset, settings.scale, log)
     _, held_out = data.split(settings.held_out_every)
+    held_out = with_refined(held_out, training.load_cameras())
     model = GaussianModel.load(training.map)
     scores = summary(score_held_out(model, ImageCache(held_out), settings.options, data.scene_extent))
     if as_json:
@@ -83,6 +85,7 @@ def _eval_training(folder: Path, *, log: str | None, as_json: bool) -> int:
         return 0
     rows = [(view["name"], f"{decibels(view['psnr_db'])}, SSIM {number(view['ssim'], 3)}") for view in scores["views"]]
     rows.append(("mean", f"{decibels(scores['psnr_db'])}, SSIM {number(scores['ssim'], 3)}"))
+    rows.append(("colour-corrected", decibels(scores["corrected_psnr_db"])))
     print_table(rows, title=f"{folder}: {scores['held_out']} held-out views")
     return 0
 

@@ -44,3 +44,19 @@ def test_without_the_options_nothing_is_estimated(tmp_path: Path, capsys: pytest
     assert "colour-corrected PSNR" in printed
     assert "camera" not in printed
     assert not {"cameras.json", "exposures.json"} & {path.name for path in out.iterdir()}
+
+
+def test_eval_scores_held_out_views_with_the_refined_intrinsics(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    train(write_wide_scene(tmp_path / "scene", points=200, rows=3), out, capsys, "--refine-intrinsics")
+    values = json.loads((out / "cameras.json").read_text())
+    values["cameras"][0]["refined"]["fx"] *= 1.5
+    assert main(["eval", str(out), "--json"]) == 0
+    scores = json.loads(capsys.readouterr().out)
+    saved = json.loads((out / "scores.json").read_text())
+    assert saved | scores == saved
+    (out / "cameras.json").write_text(json.dumps(values))
+    assert main(["eval", str(out), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["psnr_db"] != scores["psnr_db"]
