@@ -100,7 +100,7 @@ class Point:
 
 
 @dataclass(frozen=True)
-class Curve:
+class PlotCurve:
     """Points of one method.
 
     Args:
@@ -130,7 +130,7 @@ class Panel:
     title: str
     x: str
     y: str
-    curves: Sequence[Curve]
+    curves: Sequence[PlotCurve]
     x_scale: Scale = "linear"
     y_scale: Scale = "linear"
 
@@ -206,7 +206,7 @@ def _draw_panel(axis: Axes, panel: Panel, styles: dict[str, tuple[str, str]]) ->
     return handles
 
 
-def _finite(curve: Curve, panel: Panel) -> list[Point]:
+def _finite(curve: PlotCurve, panel: Panel) -> list[Point]:
     """Return the points that the axes can show."""
 
     def shown(p: Point) -> bool:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from scipy.stats import binomtest
 
-from splatbot.bench.plots import Curve, Panel, Point, save_plot
+from splatbot.bench.plots import Panel, PlotCurve, Point, save_plot
 from splatbot.bench.results import Results
 
 _DEFAULT = " (default)"
@@ -20,7 +20,7 @@ def plot_accuracy(results: Results, out: Path) -> None:
     for name, certified in (("certified, tolerance", True), ("sampled, samples", False)):
         chosen = [case for case in cases if ("certified" in case) is certified]
         times = [results.find(case, "an edge") for case in chosen]
-        curves.append(Curve(name, _missed(results, chosen, times)))
+        curves.append(PlotCurve(name, _missed(results, chosen, times)))
     panel = Panel("Collision checks of edges", "time of an edge [µs]", "missed collisions [%]", curves, "log", "log")
     save_plot([panel], out, "collision-accuracy")
 
@@ -39,7 +39,7 @@ def plot_sigma(results: Results, out: Path) -> None:
         for case, x in zip(cases, sigmas, strict=True)
         if (y := results.find(case, "false hit")) is not None
     ]
-    curves = [Curve("false hit", hits), Curve("false free", _missed(results, cases, sigmas, labelled=False))]
+    curves = [PlotCurve("false hit", hits), PlotCurve("false free", _missed(results, cases, sigmas, labelled=False))]
     name = f"Configurations, {title.removeprefix('sweep n_sigma on ')}"
     save_plot([Panel(name, "n_sigma", "wrong answers [%]", curves, "linear", "log")], out, "collision-sigma")
 

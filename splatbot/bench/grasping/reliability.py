@@ -13,7 +13,7 @@ from splatbot.bench.benchmark import ReportProgress, ignore_progress
 from splatbot.bench.grasping import GraspingSettings
 from splatbot.bench.grasping.scenes import over_scenes
 from splatbot.bench.machine import describe_machine
-from splatbot.bench.plots import Curve, Panel, Point, save_plot
+from splatbot.bench.plots import Panel, PlotCurve, Point, save_plot
 from splatbot.bench.results import Results
 from splatbot.grasping.affordance import AffordanceError
 from splatbot.sim.compare.agreement import wilson
@@ -111,8 +111,8 @@ def plot_reliability(results: Results, folder: Path) -> None:
             interval = wilson(round(y * n), round(n))
             points.append(Point(found["confidence, mean"], y, f"{n:.0f}", low=interval.low, high=interval.high))
     curves = [
-        Curve("calibrated", [Point(0.0, 0.0), Point(1.0, 1.0)], "reference"),
-        Curve("grasps (simulated), with their number", points, "points"),
+        PlotCurve("calibrated", [Point(0.0, 0.0), Point(1.0, 1.0)], "reference"),
+        PlotCurve("grasps (simulated), with their number", points, "points"),
     ]
     panel = Panel("Reliability of grasps", "stated confidence", "share of successes", curves)
     save_plot([panel], folder, "reliability")

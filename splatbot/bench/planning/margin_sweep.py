@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from splatbot.bench.planning_problems import Problem
-from splatbot.bench.plots import Curve, Panel, Point, save_plot
+from splatbot.bench.plots import Panel, PlotCurve, Point, save_plot
 from splatbot.bench.results import Results
 from splatbot.collision import GaussianCollisionField
 from splatbot.collision.audit import SurfaceAudit
@@ -84,12 +84,12 @@ def plot_margins(results: Results, out: Path) -> None:
         for metric in ("missed surface", "false hits", "solved"):
             rows = [row for row in results.select(f"{name}, margin ") if (row.metric, row.unit) == (metric, "%")]
             shares = [Point(float(row.case.split()[-2]), row.value) for row in rows if row.value is not None]
-            curves.append(Curve(metric, shares))
+            curves.append(PlotCurve(metric, shares))
         marks = [
             Point(row.value, 100.0 * (1.0 - float(row.metric)), row.metric)
             for row in results.select(f"{name}, margin at confidence")
             if row.value is not None
         ]
-        curves.append(Curve("margin at confidence", marks, "points"))
+        curves.append(PlotCurve("margin at confidence", marks, "points"))
         panel = Panel(name, "margin [mm]", "share [%]", curves, "linear", "log")
         save_plot([panel], out, f"planning-margins-{name}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from splatbot.bench.planning import BUDGET
-from splatbot.bench.plots import Curve, Panel, Point, save_plot
+from splatbot.bench.plots import Panel, PlotCurve, Point, save_plot
 from splatbot.bench.results import Results
 
 DEFAULT_MS = 28.0
@@ -26,7 +26,7 @@ def plot_cost(results: Results, out: Path) -> None:
         label = "" if row.peer else f"{budget:g} ms{_solved(results, row.case)}"
         point = Point(budget, row.value, label, row.peer is None and budget == DEFAULT_MS, low, high)
         curves.setdefault(row.peer or "splatbot", []).append(point)
-    drawn = [Curve(name, points) for name, points in curves.items()]
+    drawn = [PlotCurve(name, points) for name, points in curves.items()]
     save_plot([Panel("Planning", "time budget [ms]", "path length, mean [rad]", drawn, "log")], out, "planning-cost")
 
 

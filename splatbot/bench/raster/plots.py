@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from splatbot.bench.plots import Curve, Panel, Point, save_plot
+from splatbot.bench.plots import Panel, PlotCurve, Point, save_plot
 from splatbot.bench.raster.sweeps import GROWTH, SWEEP
 from splatbot.bench.results import Results
 
@@ -15,7 +15,7 @@ _DEFAULT = " (default)"
 def plot_sweeps(results: Results, out: Path) -> None:
     """Write ``raster-sweeps.png``, ``.svg``: largest error over time, a panel per knob, the default marked."""
     panels = [
-        Panel(knob, "forward [ms]", "largest error of a colour", [Curve("splatbot", points)], "linear", "log")
+        Panel(knob, "forward [ms]", "largest error of a colour", [PlotCurve("splatbot", points)], "linear", "log")
         for knob in _KNOBS
         if (points := _points(results, knob))
     ]
@@ -30,10 +30,10 @@ def plot_growth(results: Results, out: Path) -> None:
         curves = []
         for metric in ("forward+backward", "stages over Gaussians", "stages over pixels"):
             points = [Point(int(r.case.rpartition(" ")[2]), r.value) for r in rows if r.metric == metric and r.value]
-            curves.append(Curve(metric, points))
+            curves.append(PlotCurve(metric, points))
         first, last = curves[0].points[0], curves[0].points[-1]
         slope = last.y / last.x
-        curves.append(Curve("linear", [Point(first.x, slope * first.x), Point(last.x, last.y)], "reference"))
+        curves.append(PlotCurve("linear", [Point(first.x, slope * first.x), Point(last.x, last.y)], "reference"))
         panels.append(Panel(f"Growth with {kind}", kind, "time [ms]", curves, "log", "log"))
     save_plot(panels, out, "raster-growth")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from splatbot.bench.plots import Curve, Panel, Point, save_plot
+from splatbot.bench.plots import Panel, PlotCurve, Point, save_plot
 from splatbot.bench.results import Results
 
 
@@ -12,7 +12,7 @@ def plot_utilisation(results: Results, out: Path) -> None:
     """Write ``sizing.png`` and ``.svg``: the share of each resource in use on the planned nodes."""
     robots, shares = results.curves["robots"], results.curves["utilisation"]
     curves = [
-        Curve(name, [Point(x, 100.0 * share[name]) for x, share in zip(robots, shares, strict=True)], "line")
+        PlotCurve(name, [Point(x, 100.0 * share[name]) for x, share in zip(robots, shares, strict=True)], "line")
         for name in shares[0]
     ]
     planned = results.curves["planned"]
@@ -21,5 +21,5 @@ def plot_utilisation(results: Results, out: Path) -> None:
         Point(planned, 100.0, f"{planned:g} planned", default=True),
         Point(max(robots), 100.0),
     ]
-    curves.append(Curve("100 %", full, "reference"))
+    curves.append(PlotCurve("100 %", full, "reference"))
     save_plot([Panel("Utilisation", "robots (simulated)", "utilisation [%]", curves, "log", "log")], out, "sizing")

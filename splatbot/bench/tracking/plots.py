@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from splatbot.bench.plots import Curve, Panel, Point, save_plot
+from splatbot.bench.plots import Panel, PlotCurve, Point, save_plot
 from splatbot.bench.results import Results
 from splatbot.config import Config
 
@@ -23,11 +23,11 @@ def plot_tracking(results: Results, out: Path) -> None:
     if any(row.peer is not None for row in results.rows):
         logs = dict.fromkeys(log for log, _ in curves)
         of_log = {
-            log: [Curve(name or "splatbot", p) for (own, name), p in curves.items() if own == log] for log in logs
+            log: [PlotCurve(name or "splatbot", p) for (own, name), p in curves.items() if own == log] for log in logs
         }
         panels = [Panel(log, *axes, found, "log", "log") for log, found in of_log.items()]
     else:
-        names = [Curve(f"{log} {name}".rstrip(), points) for (log, name), points in curves.items()]
+        names = [PlotCurve(f"{log} {name}".rstrip(), points) for (log, name), points in curves.items()]
         panels = [Panel("Tracking", *axes, names, "log", "log")]
     save_plot(panels, out, "tracking")
 

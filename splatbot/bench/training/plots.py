@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from splatbot.bench.plots import Curve, Panel, Point, save_plot
+from splatbot.bench.plots import Panel, PlotCurve, Point, save_plot
 from splatbot.bench.results import Results
 
 
@@ -12,14 +12,14 @@ def plot_training(results: Results, out: Path) -> None:
     """Write ``training.png``, ``.svg``: PSNR against seconds, the default setting in each panel."""
     courses = {case: [Point(*pair) for pair in course] for case, course in results.curves.items()}
     *before, end = courses.pop("(default)")
-    default = Curve("default setting", [*before, Point(end.x, end.y, default=True)])
+    default = PlotCurve("default setting", [*before, Point(end.x, end.y, default=True)])
     knobs = dict.fromkeys(case.split()[0] for case in courses) or {"": None}
     panels = [
         Panel(
             knob,
             "time of training [s]",
             "PSNR of held-out views [dB]",
-            [default, *(Curve(case, course) for case, course in courses.items() if case.split()[0] == knob)],
+            [default, *(PlotCurve(case, course) for case, course in courses.items() if case.split()[0] == knob)],
         )
         for knob in knobs
     ]

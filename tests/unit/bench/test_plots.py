@@ -15,13 +15,13 @@ from matplotlib.colors import same_color
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from splatbot.bench.plots import DEFAULT_COLOR, Curve, Panel, Point, draw, save_plot
+from splatbot.bench.plots import DEFAULT_COLOR, Panel, PlotCurve, Point, draw, save_plot
 
 LINEAR = ("t", "x [m]", "y [m]")
 
 
-def curve(name: str, values: list[tuple[float, float, str]], default: str = "") -> Curve:
-    return Curve(name, [Point(x, y, label, default=label == default) for x, y, label in values])
+def curve(name: str, values: list[tuple[float, float, str]], default: str = "") -> PlotCurve:
+    return PlotCurve(name, [Point(x, y, label, default=label == default) for x, y, label in values])
 
 
 BUDGETS = ("30 ms", "100 ms", "300 ms", "1000 ms")
@@ -34,13 +34,13 @@ LOGS = {
 }
 TRACKING = [curve(name, list(zip(x, y, BUDGETS, strict=True)), "100 ms") for name, (x, y) in LOGS.items()]
 EDGES = [
-    Curve("certified", [Point(9.4, 0.0, "1 mm", True, 0.0, 0.0035), Point(9.0, 0.0, "3 mm", False, 0.0, 0.0035)]),
+    PlotCurve("certified", [Point(9.4, 0.0, "1 mm", True, 0.0, 0.0035), Point(9.0, 0.0, "3 mm", False, 0.0, 0.0035)]),
     curve(
         "sampled", [(1.4, 0.3, "4 samples"), (2.0, 0.06, "8"), (4.6, 0.0045, "16"), (7.3, 0.0, "32"), (14.8, 0.0, "64")]
     ),
 ]
 PLANS = [
-    Curve(
+    PlotCurve(
         "splatbot",
         [
             Point(x, y, f"{x:g} ms{note}", x == 28, y - 0.03, y + 0.03)
