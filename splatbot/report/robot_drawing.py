@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import open3d as o3d
 from numpy.typing import NDArray
 
 from splatbot.camera import Camera
@@ -52,6 +51,8 @@ class DrawnPart:
 
 def sphere_parts(spheres: LinkSpheres, link: int, margin: float, color: Color) -> list[DrawnPart]:
     """Return the spheres of a link as parts to draw, each with a radius larger by ``margin`` [m]."""
+    import open3d as o3d
+
     ball = o3d.geometry.TriangleMesh.create_sphere(resolution=CONSTANTS.sphere_resolution)
     triangles = np.asarray(ball.vertices)[np.asarray(ball.triangles)]
     own = spheres.link == link
@@ -93,6 +94,8 @@ def draw_robot(
         tint: (3,) colour that is mixed in, to distinguish postures. If None, the robot has its own colours.
         opacity: 0..1, small for postures in passing.
     """
+    import open3d as o3d
+
     triangles = [transform_points(T_world_links[part.link], part.triangles) for part in parts]
     scene = o3d.t.geometry.RaycastingScene()
     for corners in triangles:
