@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any, NamedTuple, TextIO
 
-from splatbot.cli.messages import print_message
+from splatbot.cli.messages import interruption, print_message, set_interruption
 
 
 class _Command(NamedTuple):
@@ -122,6 +122,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in words or os.environ.get("SPLATBOT_DEBUG", "") not in ("", "0")
     words = [word for word in words if word != "--debug"]
+    set_interruption()
     if words == ["--version"]:
         from splatbot import __version__
 
@@ -136,7 +137,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print_message("error", error)
         return error.exit_code
     except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
+        print(interruption(), file=sys.stderr)
         return 130
     except BrokenPipeError:  # `splatbot info ... | head` is no error; Python must not flush to the dead pipe again
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -174,7 +175,7 @@ def _interrupts_while_libraries_load() -> Iterator[None]:
 def _on_interrupt(number: int, frame: FrameType | None) -> None:
     while frame is not None:
         if frame.f_code.co_filename.startswith("<frozen importlib"):
-            os.write(2, b"interrupted\n")
+            os.write(2, f"{interruption()}\n".encode())
             os._exit(130)
         frame = frame.f_back
     raise KeyboardInterrupt

@@ -280,7 +280,7 @@ def _print_summary(result: RunResult) -> None:
     m = result.metrics
     ms = m["ms_per_frame"]
     rows = [
-        ("frames tracked", f"{m['tracked']} of {m['frames']}" + (f", {m['skipped']} skipped" if m["skipped"] else "")),
+        ("frames tracked", f"{m['tracked']} of {_intended(m)}" + (f", {m['skipped']} skipped" if m["skipped"] else "")),
         *_mishaps(m),
         *_pace(m),
         *_sensor(m.get("sensor_timing")),
@@ -293,5 +293,21 @@ def _print_summary(result: RunResult) -> None:
         *(("question", doubt) for doubt in run_doubts(m)),
         *([("report", str(result.folder / "report.html"))] if (result.folder / "report.html").exists() else []),
     ]
-    title = "interrupted; saved" if m["interrupted"] else "stopped early; saved" if m["error"] else "mapped"
-    print_table(rows, title=f"{m['log']['name']}: {title}")
+    print_table(rows, title=f"{m['log']['name']}: {_ending(m)}")
+
+
+def _intended(metrics: dict[str, Any]) -> int:
+    """Return the number of frames to track: all processed ones, or those of the log if the mapping ended early."""
+    ended_early = metrics["cut"] == "mapping" or metrics["error"]
+    return int((metrics["frames_planned"] if ended_early else None) or metrics["frames"])
+
+
+def _ending(metrics: dict[str, Any]) -> str:
+    """Return the words for the end of a run."""
+    if metrics["error"]:
+        return "stopped early; saved"
+    if not metrics["interrupted"]:
+        return "mapped"
+    return {"mapping": "interrupted; saved", "refinement": "mapped, refinement cut short; saved"}.get(
+        metrics["cut"], "mapped, scores and report cut short; saved"
+    )

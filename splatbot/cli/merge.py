@@ -14,6 +14,7 @@ from splatbot.results.merge_output import check_merge, draft_of, restore_run
 
 if TYPE_CHECKING:
     from splatbot.mapping.alignment import MapAlignment
+    from splatbot.mapping.joining import JoinedModel
     from splatbot.run.merging import MergedRun
 
 
@@ -103,6 +104,13 @@ def pose_rows(alignment: MapAlignment) -> list[tuple[str, str]]:
     ]
 
 
+def _refined(joined: JoinedModel, refined: int) -> str:
+    """Return the number of Gaussians after the refinement as the sum of those that remain, join and appear."""
+    more = refined - joined.kept - joined.added
+    by_refinement = f"{more:,} more" if more >= 0 else f"{-more:,} fewer"
+    return f"{refined:,}: {joined.kept:,} kept, {joined.added:,} added, {by_refinement} by the refinement"
+
+
 def _print(out: Path, found: MergedRun) -> None:
     from splatbot.cli.tables import print_table
     from splatbot.results.units import count, metres
@@ -113,7 +121,7 @@ def _print(out: Path, found: MergedRun) -> None:
         ("overlap", f"{joined.overlap:.0%} of the Gaussians of B lie on the surface of A"),
         ("Gaussians of A", f"{count(joined.kept)} kept, {count(joined.removed)} removed"),
         ("Gaussians of B", f"{count(joined.added)} added, {count(joined.covered)} on the surface of A"),
-        ("Gaussians, refined", count(metrics["gaussians"])),
+        ("Gaussians, refined", _refined(joined, metrics["gaussians"])),
         ("ATE RMSE", metres(metrics["ate_rmse_m"])),
         *([("time offset of B", f"{found.time_offset:.3f} s")] if found.time_offset else []),
     ]

@@ -7,6 +7,20 @@ import sys
 import textwrap
 from typing import TextIO
 
+_INTERRUPTED = "interrupted"
+_if_interrupted = _INTERRUPTED
+
+
+def set_interruption(words: str = _INTERRUPTED) -> None:
+    """Set the message of a Ctrl-C that ends the process from here on."""
+    global _if_interrupted
+    _if_interrupted = words
+
+
+def interruption() -> str:
+    """Return the message of a Ctrl-C that ends the process here."""
+    return _if_interrupted
+
 
 def print_message(kind: str, text: object, file: TextIO | None = None) -> None:
     """Print ``kind: text``; see :func:`fitted`.

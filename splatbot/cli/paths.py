@@ -46,7 +46,7 @@ def check_output(path: Path | None, flag: str = "--out", *, folder: bool = True)
     but /proc takes no files.
 
     Raises:
-        InputError: the path names something else.
+        InputError: the path names something else, or the folder takes no files.
         OSError: the folder or its disk is not for writing.
     """
     if path is None:
@@ -70,6 +70,9 @@ def check_output(path: Path | None, flag: str = "--out", *, folder: bool = True)
         try:
             with tempfile.TemporaryFile(dir=place):
                 pass
+        except FileNotFoundError as error:  # of /proc, which exists and takes no files
+            hint = f"name a place outside {place}, which takes no files"
+            raise InputError("cannot be created.", file=path, field=flag, hint=hint) from error
         except OSError as error:
             raise OSError(error.errno, error.strerror, str(path)) from error
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from splatbot.cli.messages import set_interruption
 from splatbot.cli.paths import check_output, check_training
 from splatbot.errors import InputError
 from splatbot.layouts import MAP_NAME, dataset_kind, log_kind
@@ -128,6 +129,7 @@ def train(
         log_kind(log)
     check_output(out)
     port = _viewer_port(viewer)
+    set_interruption("interrupted; nothing was trained yet")
 
     from splatbot.cli.datasets import open_training_data
     from splatbot.training.distributed import planned_group
@@ -213,6 +215,7 @@ def _train(
                 if not resumed and group.leads:
                     folder.begin(settings)
                     begun = True
+                set_interruption()
             with _shown(session, page, folder.path.name, quiet=quiet) as observe:
                 session.run(report=report, stop=lambda: interrupts.requested is not None, observe=observe)
         if not group.leads:

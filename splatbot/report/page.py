@@ -71,11 +71,17 @@ def _banner(metrics: Mapping[str, Any]) -> str:
     if metrics["error"]:
         return f'<section class="banner"><b>The log ended early.</b> {html.escape(metrics["error"])}</section>\n'
     if metrics["interrupted"]:
-        return (
-            f'<section class="banner warn"><b>Interrupted</b> after {metrics["frames"]} of '
-            f"{metrics['log']['frames']} frames; the report covers the part mapped until then.</section>\n"
-        )
+        return f'<section class="banner warn">{_interruption(metrics)}</section>\n'
     return ""
+
+
+def _interruption(metrics: Mapping[str, Any]) -> str:
+    if metrics["cut"] == "refinement":
+        return "<b>The refinement was cut short</b> after all frames; `splatbot map --resume` refines the map."
+    return (
+        f"<b>Interrupted</b> after {metrics['frames']} of {metrics['log']['frames']} frames; the report covers the "
+        "part mapped until then."
+    )
 
 
 def _tiles(metrics: Mapping[str, Any]) -> str:

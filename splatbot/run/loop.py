@@ -7,7 +7,7 @@ from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, field
 from itertools import count
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +53,7 @@ class FrameLoop:
         crash: the unexpected exception that ended the loop.
         first_bad: the first unreadable frame.
         started: clock at the start [s].
+        cut: the phase that a signal cut short, "mapping" or "refinement".
         saver: saves the run while it goes on.
     """
 
@@ -72,6 +73,7 @@ class FrameLoop:
     first_bad: InputError | None = None
     started: float = field(default_factory=time.perf_counter)
     saver: FrameSaver | None = None
+    cut: Literal["mapping", "refinement"] | None = None
 
     def run(self, interrupts: Interrupts) -> None:
         """Process the frames until they end or until an error, a crash or a signal; never raises."""
@@ -90,6 +92,8 @@ class FrameLoop:
                 self.slam.finish(stop=self._stop_of_refinement(interrupts))
             else:
                 self.slam.close_loops()
+            if interrupts.requested is not None:
+                self.cut = "refinement" if through else "mapping"
         except Exception as crash:  # a bug; it is raised again once the map is saved
             self.crash = crash
         finally:

@@ -146,6 +146,8 @@ class RunOutcome:
             "localised_in": self.localised_in,
             "saves": self.loop.saver.cost if self.loop.saver is not None else None,
             "interrupted": self.interrupts.requested is not None,
+            "cut": self.loop.cut,
+            "frames_planned": self.loop.source.total or None,
             "error": str(error) if error else None,
             "log": {"name": log.name, "frames": len(log), "uri": _absolute(log.uri), **self.source},
             "splatbot": __version__,

@@ -23,6 +23,7 @@ _NOT_SAVED = {
     "crash",
     "first_bad",
     "started",
+    "cut",
 }
 
 

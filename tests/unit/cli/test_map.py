@@ -90,7 +90,7 @@ def test_a_bad_frame_stops_with_code_2_after_saving(run: RunCommand, log_folder:
     answer = run("map", log_folder, "--out", tmp_path / "run")
     assert answer.code == 2
     assert "000005.png" in answer.err.splitlines()[-1]
-    assert "5 of 5" in answer.out
+    assert "5 of 16" in answer.out
     assert json.loads((tmp_path / "run" / "metrics.json").read_text())["tracked"] == 5
 
 
@@ -116,7 +116,30 @@ def test_ctrl_c_says_what_was_saved_and_exits_with_130(
     answer = run("map", log_folder, "--out", tmp_path / "run")
     assert answer.code == 130
     assert "interrupted; saved" in answer.out
+    assert "4 of 16" in answer.out
     assert (tmp_path / "run" / "map.ply").exists()
+
+
+@pytest.mark.parametrize(
+    ("phase", "words"),
+    [("refining", "mapped, refinement cut short; saved"), ("scoring", "mapped, scores and report cut short; saved")],
+)
+def test_a_signal_after_the_last_frame_is_named_by_the_phase_that_it_cut(
+    run: RunCommand, log_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, phase: str, words: str
+) -> None:
+    show = PlainLines.__call__
+
+    def interrupting(self: PlainLines, progress: Progress) -> None:
+        show(self, progress)
+        if progress.phase == phase and progress.step == 0:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(PlainLines, "__call__", interrupting)
+    answer = run("map", log_folder, "--out", tmp_path / "run", "--no-report")
+    assert answer.code == 130
+    assert words in answer.out
+    assert "interrupted" not in answer.out
+    assert "16 of 16" in answer.out
 
 
 def at(done: int, verdict: str = "ok", elapsed: float = 0.0) -> Progress:
@@ -151,8 +174,8 @@ def test_phases_after_the_frames_are_named() -> None:
     [
         (["--resume", "a", "--localise", "b"], "--resume"),
         (["--resume", "a", "--set", "seed=3"], "keeps its configuration"),
-        (["--resume", "nowhere"], "run.state"),
-        (["LOG", "--localise", "nowhere"], "run.state"),
+        (["--resume", "nowhere"], "nowhere: --resume: does not exist"),
+        (["LOG", "--localise", "nowhere"], "nowhere: --localise: does not exist"),
     ],
 )
 def test_a_saved_run_that_cannot_be_used_is_reported_before_anything_is_written(

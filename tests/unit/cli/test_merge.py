@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -11,6 +12,7 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
+from plyfile import PlyData
 
 from splatbot.cli.merge import pose_rows
 from splatbot.config import Config
@@ -95,6 +97,16 @@ def test_an_interrupted_merge_leaves_no_folder_and_the_same_command_then_succeed
     assert run(*words).code == 0
     assert_fix_named(run(*words), "--overwrite")
     assert run(*words, "--overwrite").code == 0
+
+
+def test_the_printed_gaussians_of_a_merge_add_up(run: RunCommand, runs: tuple[str, str], work_folder: Path) -> None:
+    answer = run("merge", *runs, "--out", "c", "--no-report")
+    assert answer.code == 0, answer.err
+    found = re.search(r"([\d,]+): ([\d,]+) kept, ([\d,]+) added, ([\d,]+) (more|fewer) by the refinement", answer.out)
+    assert found is not None, answer.out
+    total, kept, added, change = (int(number.replace(",", "")) for number in found.groups()[:4])
+    assert total == kept + added + (change if found[5] == "more" else -change)
+    assert total == PlyData.read("c/map.ply")["vertex"].count
 
 
 @pytest.mark.parametrize("failure", [KeyboardInterrupt, OSError(28, "No space left on device")])

@@ -282,6 +282,16 @@ def test_resume_before_the_first_save_says_what_happened(run: RunCommand, tmp_pa
     assert "splatbot map LOG" in answer.err
 
 
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs /proc, which takes no files, not even of root")
+@pytest.mark.parametrize("words", [["map", "{log}", "--out", "/proc/x"], ["record", "{log}", "--out", "/proc/x.mcap"]])
+def test_a_place_that_takes_no_files_cannot_be_created(
+    run: RunCommand, make_names: dict[str, str], words: list[str]
+) -> None:
+    answer = run(*(word.format(**make_names) for word in words))
+    assert_refused(answer, f"{words[-1]}: --out: cannot be created. Fix: name a place outside /proc")
+    assert "removed" not in answer.err
+
+
 def test_info_opens_a_recording_in_one_file(run: RunCommand, log_folder: Path, tmp_path: Path) -> None:
     assert run("record", log_folder, "--out", tmp_path / "a.mcap").code == 0
     answer = run("info", tmp_path / "a.mcap")
