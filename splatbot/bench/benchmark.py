@@ -8,6 +8,7 @@ so that `--help` does not wait for torch or open3d.
 from __future__ import annotations
 
 import importlib
+import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -55,7 +56,7 @@ class Settings:
         out: Folder for the JSON and CSV files and the plots. If not given, runs/bench-NAME.
         json: Additional path for the JSON file.
         csv: Additional path for the CSV file.
-        quick: Run a tiny workload in seconds, to check that the benchmark runs.
+        quick: Run a tiny workload, to check that the benchmark runs: seconds, or a minute on a busy machine.
         redraw: Do not measure; draw the plots again from the JSON file in the folder.
     """
 
@@ -114,6 +115,8 @@ class Benchmark:
     def run(self, settings: Settings, report_progress: ReportProgress = ignore_progress) -> Results:
         """Measure, and write the JSON and CSV files and the plots; with ``redraw`` only the plots.
 
+        Ctrl-C before the first results removes the folder if this run made it.
+
         Raises:
             InputError: A setting makes no sense, or there are no results to draw.
         """
@@ -124,8 +127,14 @@ class Benchmark:
         settings.validate()
         if settings.quick:
             settings = replace(settings, **settings.quick_values)
+        is_new = not settings.folder.exists()
         settings.folder.mkdir(parents=True, exist_ok=True)
-        results = self.measure(settings, report_progress)
+        try:
+            results = self.measure(settings, report_progress)
+        except KeyboardInterrupt:
+            if is_new and not (settings.folder / f"{settings.stem}.json").exists():
+                shutil.rmtree(settings.folder)  # it has no results, only logs of programs
+            raise
         settings.save(results)
         results.write_csv(settings.folder / f"{settings.stem}.csv")
         self.plot(results, settings.folder)

@@ -116,6 +116,7 @@ def gigabits(text: str, field: str) -> float:
 
 
 def _measure(settings: SizingSettings, report_progress: ReportProgress) -> Results:
+    report_progress("loading the libraries")
     from splatbot.bench.sizing.report import run_sizing
 
     return run_sizing(settings, report_progress)

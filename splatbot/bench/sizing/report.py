@@ -26,6 +26,7 @@ def run_sizing(settings: SizingSettings, report_progress: ReportProgress) -> Res
     if settings.costs:
         results, costs = read_costs(settings.costs)
     else:
+        report_progress("the peak of this machine")
         results = Results(describe_machine((1,), peak_ms=settings.peak_ms))
         costs = measure_costs(settings, results, report_progress)
         costs.add_to(results)

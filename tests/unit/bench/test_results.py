@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from splatbot.bench.benchmark import Benchmark, ReportProgress, Settings
 from splatbot.bench.results import Results, Row
 from splatbot.cli import main
 from splatbot.errors import InputError
@@ -51,3 +52,27 @@ def test_redraw_draws_the_plot_of_saved_results_and_prints_their_table(
 def test_redraw_without_results_names_the_missing_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "planning", "--redraw", "--out", str(tmp_path)]) == 2
     assert "planning.json" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("kept", [(), ("a.json",), ("results.txt",)])
+def test_ctrl_c_leaves_a_folder_only_if_it_has_results_or_was_there_before(
+    tmp_path: Path, kept: tuple[str, ...]
+) -> None:
+    class ASettings(Settings):
+        name = "a"
+
+    folder = tmp_path / "out"
+    if "results.txt" in kept:
+        folder.mkdir()
+        (folder / "results.txt").touch()
+
+    def measure(settings: Settings, report_progress: ReportProgress) -> Results:
+        (settings.folder / "service.log").touch()
+        if "a.json" in kept:
+            settings.save(Results(MACHINE))
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        Benchmark(ASettings, measure, ()).run(ASettings(out=folder))
+    assert folder.exists() == bool(kept)
+    assert all((folder / name).exists() for name in kept)
