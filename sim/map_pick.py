@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -16,6 +17,7 @@ from splatbot.grasping.pick import Picker
 from splatbot.grasping.pick_types import PickOptions, PickResult, PickStage, PickStep
 from splatbot.grasping.sampler import GraspSampler
 from splatbot.grasping.types import GraspResult
+from splatbot.planning.problem import link_words
 from splatbot.protocols import Array
 from splatbot.robots.robot import RobotModel
 from splatbot.sim.contact_monitor import ClearanceMonitor, ContactEvent, ContactMonitor, MinimumClearance
@@ -90,12 +92,21 @@ class MapPick:
         """Return the reasons for which the pick should not be executed; empty if it should."""
         found = [] if self.result else [f"{self.result.outcome}: {self.result.reason}"]
         found += [
-            f"{contact.part} touches {contact.other} at {contact.first:.2f} s, {1e3 * contact.depth:.1f} mm deep"
+            f"{self.words(contact.part)} touches {self.words(contact.other)} at {contact.first:.2f} s, "
+            f"{1e3 * contact.depth:.1f} mm deep"
             for contact in self.contacts
         ]
         if self.result and self.rose < CONSTANTS.min_rise * self.wanted:
             found.append(f"the target rose by {1e3 * self.rose:.0f} mm of {1e3 * self.wanted:.0f} mm")
         return tuple(found)
+
+    def words(self, part: str) -> str:
+        """Return the words for a part of the arm, as causes of plans name links; other names stay."""
+        robot = self.recording.world.robot
+        if robot is None or not re.fullmatch(r"link\d+", part):
+            return part
+        link = int(part.removeprefix("link"))
+        return link_words(link, robot.chain.names[link - 1] if link > 0 else "")
 
     @property
     def outcome(self) -> str:

@@ -15,7 +15,8 @@ from splatbot.collision import RobotSpheres
 from splatbot.geometry import inverse
 from splatbot.grasping.affordance import Target
 from splatbot.grasping.attached import within
-from splatbot.grasping.pick_planner import PickPlan, Segment, in_hand, raised, target_spheres
+from splatbot.grasping.lift import in_hand, raised, target_spheres
+from splatbot.grasping.pick_planner import PickPlan, Segment
 from splatbot.grasping.pick_types import PickOptions
 from splatbot.grasping.reach import Reached
 from splatbot.grasping.sampler import GraspSampler

@@ -212,9 +212,9 @@ def _print(picked: MapPick, known: GraspFile, folder: Path) -> None:
         clearance = clearance_text(motion.trajectory.certificate)
         rows.append((name.removesuffix(".json"), f"{length}, {opening}, clearance {clearance}"))
     rows.append(("margin", f"{1e3 * known.arm_margin:.1f} mm before the hand, {1e3 * known.margin:.1f} mm at the hand"))
-    rows.append(("verdict", _verdict(picked)))
+    rows.append(("verdict", _verdict(picked) if result else str(result.outcome)))  # a row above has the reason
     if near.part:
-        where = f"{near.part} and {near.other} at {near.time:.1f} s"
+        where = f"{picked.words(near.part)} and {near.other} at {near.time:.1f} s"
         rows.append(("nearest in the twin", f"{1e3 * near.value:.1f} mm, {where}; without the hand"))
     print_table([*rows, ("written to", str(folder))], title=f"pick of {known.target.label}")
     print_text("the twin assumes 0.2 kg, a friction coefficient of 0.8, and the completed shape of the target")

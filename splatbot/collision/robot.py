@@ -100,7 +100,9 @@ class RobotSpheres:
         self.base_in_map = base_in_map
         self.margin = float(margin)
         self.T_world_base = _rigid(np.eye(4) if T_world_base is None else T_world_base)
-        self.spheres = _with(robot.spheres(opening), len(robot.chain), attached)
+        own = robot.spheres(opening)
+        self.spheres = _with(own, len(robot.chain), attached)
+        self.own_count = len(own.link)  # the spheres behind these are those of the attached object
         self.pairs = np.ascontiguousarray(robot.self_collision_pairs, dtype=np.int32).reshape(-1, 2)
         chain = robot.chain
         try:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from splatbot.grasping.object_list import obstacle
 from splatbot.grasping.options import GraspOptions
+from splatbot.grasping.reach import BLOCKED, BLOCKED_FAR, BLOCKED_NEAR, TOUCHES
+from splatbot.grasping.reach import CONSTANTS as REACH
 from splatbot.grasping.types import FITTING, GraspResult
 from splatbot.segmentation import SegmentedMap
 
@@ -54,7 +56,22 @@ _CHANGES = (
         "the arm would enter unknown space on its way",
         "map the place from more sides, or let unknown space be free",
     ),
-    ("blocked approach", "its approach is blocked", "give a shorter approach: --pregrasp 0.05"),
+    (
+        "cannot lift the target",
+        "it cannot be lifted",
+        "move that neighbour away; if it belongs to the target, mark both (--mask)",
+    ),
+    (
+        "touch the target before they approach",
+        TOUCHES,
+        "try the other direction: --approach top or --approach side",
+    ),
+    (
+        BLOCKED_NEAR,
+        BLOCKED,
+        "move that surface away, or try the other direction: --approach top or --approach side",
+    ),
+    (BLOCKED_FAR, BLOCKED, f"give a shorter approach: --pregrasp {REACH.short_approach:.2f}"),
 )
 
 
@@ -70,7 +87,9 @@ def first_change(
         samples: number of sampled surface points of the search.
     """
     number = result.target.number
-    size = obstacle(scene.objects[number], stroke) if 0 <= number < len(scene.objects) else None
+    known = scene.objects[number] if 0 <= number < len(scene.objects) else None
+    whole = known is not None and len(result.target.rows) >= len(known.rows)  # and no marked part of it
+    size = obstacle(known, stroke) if known is not None and whole else None
     if size is None and samples < _USUAL_SAMPLES:
         return f"{samples} sampled points of its surface are few", f"raise --samples, to {_USUAL_SAMPLES} or more"
     if result.doubtful:
@@ -88,5 +107,6 @@ def first_change(
     for reason, count in ranked:
         for words, why, change in _CHANGES:
             if count and words in reason:
-                return why, change
+                shown = result.best_rejected
+                return shown.rejected if shown is not None and shown.rejected.startswith(why) else why, change
     return "no pair of opposite faces was found", "map it again from more sides, or take another hand"

@@ -135,7 +135,7 @@ class _Pick:
             found = grasps or self.s.sample(self.target, self.o.grasp)
             if not found.grasps:
                 raise _EndedError(PickOutcome.NO_GRASP, NoGraspError(found).message)
-            self._done(f"{len(found.grasps)} grasps of {found.candidates} hands")
+            self._done("1 grasp" if len(found.grasps) == 1 else f"{len(found.grasps)} grasps")
             self.left = list(enumerate(found.grasps, start=found.first_rank))
             self._try_in_turn()
         except _EndedError as end:
@@ -170,7 +170,7 @@ class _Pick:
         candidates = self.left[: self.o.tries]
         attempts = [(k, grasp, grasp.avoids_moving and self.s.moving is not None) for k, grasp in candidates]
         attempts += [(k, grasp, False) for k, grasp, avoid_moving in attempts if avoid_moving]
-        reasons: list[str] = []
+        reasons: dict[str, list[int]] = {}
         for k, grasp, avoid_moving in attempts:
             plan = self._plan_to(grasp, start, avoid_moving)
             if isinstance(plan, PickPlan):
@@ -179,8 +179,9 @@ class _Pick:
                 self._note_moving(plan)
                 self._done(f"grasp {k}, {grasp.approach}; {1e3 * plan.clearance:.1f} mm minimum clearance")
                 return plan
-            reasons.append(f"grasp {k}: {plan}")
-        raise _EndedError(PickOutcome.NO_PLAN, "; ".join(reasons))
+            reasons.setdefault(plan, []).append(k)
+        named = (f"grasp {', '.join(str(k) for k in dict.fromkeys(ranks))}: {why}" for why, ranks in reasons.items())
+        raise _EndedError(PickOutcome.NO_PLAN, "; ".join(named))
 
     def _plan_to(self, grasp: Grasp, start: Array, avoid_moving: bool) -> PickPlan | str:
         """Plan to a grasp of the target where the latest look found it; return the reason without a plan."""

@@ -12,18 +12,18 @@ from numpy.typing import ArrayLike
 
 from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.errors import InputError
-from splatbot.geometry import inverse, transform_points
 from splatbot.grasping.affordance import Target
-from splatbot.grasping.attached import object_spheres, within
+from splatbot.grasping.attached import within
 from splatbot.grasping.hands import CONSTANTS as HANDS
+from splatbot.grasping.lift import Lift, lift_target, target_spheres
 from splatbot.grasping.moved_target import moved_grasp, moved_sampler
-from splatbot.grasping.obstacles import around_target
+from splatbot.grasping.obstacles import Surfaces, around_target, rows_around
 from splatbot.grasping.pick_types import PickOptions
 from splatbot.grasping.reach import LinkGuard, link_guards
 from splatbot.grasping.sampler import GraspSampler
 from splatbot.grasping.types import Grasp
 from splatbot.planning import GaussianRRTStar, JointGoal, Path, PoseGoal
-from splatbot.planning.cartesian import StraightResult, straight_line
+from splatbot.planning.cartesian import straight_line
 from splatbot.planning.goals import goal_configurations
 from splatbot.protocols import Array
 
@@ -143,6 +143,8 @@ class MapPickPlanner:
         # Gaussians inside of the target are its own strays, which segmentation did not assign to it.
         inside = within(around.means.detach().double().numpy(), self._object)
         around_held = around.select(torch.from_numpy(~inside))
+        rows = rows_around(sampler.scene, target.rows)
+        self._surfaces, self._surfaces_held = Surfaces(sampler.scene, rows), Surfaces(sampler.scene, rows[~inside])
         field = sampler.collision_field
         whole = sampler.field if sampler.departure is None else sampler.departure
         self._static = _Obstacles(whole, field(around), field(around_held))
@@ -172,26 +174,19 @@ class MapPickPlanner:
         hand = self._arm(opening)
         approach = straight_line(hand, obstacles.around, grasp.q_pregrasp, grasp.T_world_tcp)
         if not approach or approach.path is None:
-            return f"its approach is blocked: {approach.reason.rstrip('.')}"
-        q = approach.path.waypoints[-1]
-        closed = self._arm(grasp.width)
-        attached = in_hand(closed, q, self._object)
-        loaded = self._arm(grasp.width, attached)
-        lift_off = self._up(closed, obstacles.around_held, q, self.o.lift_off)
-        if not lift_off or lift_off.path is None:
-            return f"it cannot be lifted: {lift_off.reason.rstrip('.')}"
-        lift = self._up(loaded, obstacles.around_held, lift_off.path.waypoints[-1], self.o.lift - self.o.lift_off)
-        if not lift or lift.path is None:
-            return f"it cannot be lifted: with the object in the hand, {lift.reason.rstrip('.')}"
+            return f"its approach is blocked: {self._surfaces.reason(approach)}"
+        lift = self._lift(obstacles.around_held, approach.path.waypoints[-1], grasp.width)
+        if isinstance(lift, str):
+            return lift
         guards, guards_held = self._guards(obstacles.around), self._guards(obstacles.around_held)
         found = PickPlan(
             grasp,
             opening,
-            attached,
+            lift.attached,
             to_pregrasp=Segment(plan.path, planner.arm, obstacles.whole, avoids_moving),
             approach=Segment(approach.path, hand, obstacles.around, avoids_moving, guards),
-            lift_off=Segment(lift_off.path, closed, obstacles.around_held, avoids_moving, guards_held),
-            lift=Segment(lift.path, loaded, obstacles.around_held, avoids_moving, guards_held),
+            lift_off=Segment(lift.off, lift.closed, obstacles.around_held, avoids_moving, guards_held),
+            lift=Segment(lift.up, lift.loaded, obstacles.around_held, avoids_moving, guards_held),
             planning_seconds=planning_seconds,
         )
         for segment in (found.approach, found.lift_off, found.lift):
@@ -268,8 +263,11 @@ class MapPickPlanner:
             self.s.robot, self._T, field, margin=self.s.margin, arm_margin=self.s.arm_margin, unknown=self.s.unknown
         )
 
-    def _up(self, arm: RobotSpheres, field: GaussianCollisionField, q: Array, height: float) -> StraightResult:
-        return straight_line(arm, field, q, raised(self.s, arm, q, height))
+    def _lift(self, around_held: GaussianCollisionField, q: Array, width: float) -> Lift | str:
+        return lift_target(
+            self.s, self._object, around_held, self._surfaces_held, q, width,
+            lift_off=self.o.lift_off, height=self.o.lift,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -285,22 +283,3 @@ class Adjusted:
     sampler: GraspSampler
     planner: MapPickPlanner
     plan: PickPlan
-
-
-def target_spheres(sampler: GraspSampler, target: Target) -> Array:
-    """Cover the completed surface of a target by spheres; see :func:`splatbot.grasping.attached.object_spheres`."""
-    return object_spheres(sampler.surface(target))
-
-
-def in_hand(arm: RobotSpheres, q: Array, spheres: Array) -> Array:
-    """Transform spheres (A, 4) from the world to the frame of the last link at joint positions ``q`` (J,)."""
-    T_link_world = inverse(arm.forward(q[None])[0, -1])
-    return np.c_[transform_points(T_link_world, spheres[:, :3]), spheres[:, 3]]
-
-
-def raised(sampler: GraspSampler, arm: RobotSpheres, q: Array, height: float) -> Array:
-    """Return the tool pose T_world_tcp (4, 4) at ``q`` (J,), raised by ``height`` [m] along the up axis."""
-    tool = np.asarray(sampler.robot.T_link_tcp, dtype=np.float64)  # type: ignore[attr-defined]
-    T = np.asarray(arm.forward(q[None])[0, -1] @ tool)
-    T[:3, 3] += height * sampler.scene.up
-    return T

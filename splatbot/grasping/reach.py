@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.errors import InputError
 from splatbot.grasping.hands import CONSTANTS as HANDS
-from splatbot.planning.cartesian import along, straight_line
+from splatbot.planning.cartesian import StraightResult, along, straight_line
 from splatbot.planning.goals import goal_configurations
 from splatbot.planning.problem import PlanStatus, PoseGoal
 from splatbot.protocols import Array, HandShape, HasHand, RobotKinematics
@@ -25,16 +25,21 @@ class ReachConstants:
 
     Args:
         max_solutions: IK solutions of a grasp whose approach is tried.
+        short_approach: [m] a short straight approach, the advice where an approach is free over this length.
         max_retreat: [m] longest straight approach from a pre-grasp that was moved back, since no plan may end nearer.
         full_score_clearance: [m] clearance of the arm with the score 1.
     """
 
     max_solutions: int = 4
+    short_approach: float = 0.05
     max_retreat: float = 0.3
     full_score_clearance: float = 0.03
 
 
 CONSTANTS = ReachConstants()
+BLOCKED, TOUCHES = "its approach is blocked", "the arm touches the target before it approaches"
+BLOCKED_NEAR, BLOCKED_FAR = "have a blocked approach near the grasp", "have a blocked approach"
+"""Kinds of blocked approaches: within a short approach of the grasp, and farther away."""
 _WITH_GRIPPER = "take a robot with a gripper, as panda or ur5e-2f85 (`splatbot robot list` has all)"
 
 
@@ -46,6 +51,7 @@ class Reached:
         q: (J,) joint positions at the grasp. If None, the arm does not reach it.
         path: (K, J) path from the pre-grasp to the grasp.
         T_world_pregrasp: (4, 4) pose of the tool at its start; farther back than requested where no plan may end there.
+        blocked: the way back from the grasp, if an obstacle ends it.
         clearance: minimum clearance of the arm along the path [m].
         limits: minimum distance to a joint limit as a fraction of half the joint's range, 0..1.
         reason: reason for which the grasp is not reachable; empty if it is.
@@ -59,6 +65,7 @@ class Reached:
     reason: str = ""
     kind: str = ""
     T_world_pregrasp: Array | None = None
+    blocked: StraightResult | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,15 +213,19 @@ class ArmReach:
             kind = "no posture reaches" if goals.status is PlanStatus.NO_IK_SOLUTION else "the arm is in the way of"
             return Reached(None, None, 0.0, 0.0, goals.reason.rstrip("."), kind)
         closed = RobotSpheres(self.robot, T_world_base=self._open.T_world_base, opening=width, margin=arm.margin)
-        reason, kind = "", ""
+        reason, kind, blocked = "", "", None
+        length = float(np.linalg.norm(T_world_tcp[:3, 3] - T_world_pregrasp[:3, 3]))
         for q in goals.q:
+            blocked = None
             back = straight_line(arm, self.around, q, T_world_pregrasp)
             if not back or back.path is None:
-                reason, kind = f"its approach is blocked: {back.reason.rstrip('.')}", "have a blocked approach"
+                near = back.share * length < CONSTANTS.short_approach
+                reason, kind = f"{BLOCKED}: {back.reason.rstrip('.')}", BLOCKED_NEAR if near else BLOCKED_FAR
+                blocked = back
                 continue
             away, clearance, T_start = back.path.waypoints, back.path.certificate.clearance, T_world_pregrasp
             if self.whole is not None and arm.check(self.whole, away[-1:]).in_collision[0]:
-                reason, kind = "the arm touches the target before it approaches", "have a blocked approach"
+                reason, kind = TOUCHES, "touch the target before they approach"
                 continue
             if not self._plan_may_end(away[-1:])[0]:
                 farther = straight_line(arm, self.around, away[-1], self._farthest(T_world_tcp, T_world_pregrasp))
@@ -230,12 +241,12 @@ class ArmReach:
             if closed.check(self.around_held, q[None]).in_collision[0]:
                 reason, kind = "the closed fingers touch its surroundings", "close in the surroundings"
                 continue
-            near = next((guard for guard in self._guards if guard.meets(away)), None)
-            if near is not None:
-                reason, kind = near.reason, near.kind
+            met = next((guard for guard in self._guards if guard.meets(away)), None)
+            if met is not None:
+                reason, kind = met.reason, met.kind
                 continue
             return Reached(q, away[::-1].copy(), float(clearance), self._limits(q), T_world_pregrasp=T_start)
-        return Reached(None, None, 0.0, 0.0, reason, kind)
+        return Reached(None, None, 0.0, 0.0, reason, kind, blocked=blocked)
 
     def _plan_may_end(self, q: Array) -> NDArray[np.bool_]:
         """Return whether a plan may end at each configuration (K, J): the open hand keeps the margins there."""

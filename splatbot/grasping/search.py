@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -19,11 +20,13 @@ from splatbot.grasping.attached import object_spheres, within
 from splatbot.grasping.doubts import doubt
 from splatbot.grasping.hands import CONSTANTS as HANDS
 from splatbot.grasping.hands import Hands, measure_hands, palm_free, place_hands, usable_opening
+from splatbot.grasping.lift import lift_target, target_spheres
 from splatbot.grasping.measured import CONSTANTS as MEASURED
 from splatbot.grasping.measured import RawDepth, blind, closed_width, contact_distances, hand_penetration
-from splatbot.grasping.obstacles import around_target
+from splatbot.grasping.obstacles import Surfaces, around_target, rows_around
 from splatbot.grasping.options import GraspOptions
-from splatbot.grasping.reach import ReachabilityCheck
+from splatbot.grasping.pick_types import PickOptions
+from splatbot.grasping.reach import BLOCKED, ReachabilityCheck
 from splatbot.grasping.score import ZERO_SCORE_DISTANCE_M, arm_terms, hand_terms, suppress_similar, totals
 from splatbot.grasping.sweep import finger_clearance, swept_clearance, touches
 from splatbot.grasping.types import FITTING, Grasp, GraspResult
@@ -70,6 +73,7 @@ _IN_TARGET = "hands are in the target on their way"
 _IN_MAP = "hands touch the surroundings of the target"
 _UNEVEN = "hands have something that stands out under a pad"
 _IN_DEPTH = "hands are in measured depth"
+_UNLIFTED = "cannot lift the target"
 _DEEP = "are in measured depth"  # the kind of a rejection by the dense check
 
 
@@ -124,6 +128,7 @@ class Search:
                 self.s.scene.model.means.detach().double().numpy()[self.target.rows], self.s.hand
             )
             self.log.stage("measured depth")
+        self.lift = self._lift() if self.s.departure is not None else None
         grasps, doubtful = self._by_evidence(self._search(self.o.samples))
         notes = []
         too_large = not len(self.pairs.width) and self.found.too_wide > 0
@@ -336,8 +341,9 @@ class Search:
         blocked = [(grasp, kind) for grasp, kind in checked if grasp.rejected]
         for _, kind in blocked:
             self.log.drop(FITTING + kind, 1)
-        if blocked:
-            self.log.best = blocked[0][0]
+        if blocked:  # the best of the most frequent kind, which the advice names
+            usual = Counter(kind for _, kind in blocked).most_common(1)[0][0]
+            self.log.best = next(grasp for grasp, kind in blocked if kind == usual)
         found += [grasp for grasp, _ in checked if not grasp.rejected]
         return tuple(sorted(found, key=lambda g: (not g.avoids_moving, -g.total)))
 
@@ -361,13 +367,32 @@ class Search:
         """Check a grasp with the arm and with all measured depth; return it with the kind of its rejection."""
         judged, kind = (grasp, "") if reach is None else self._with_arm(grasp, reach)
         if not judged.rejected and self.s.raw is not None:
-            return self._at_full_density(judged, self.s.raw)
-        return judged, kind
+            judged, kind = self._at_full_density(judged, self.s.raw)
+        if judged.rejected or judged.q is None or self.lift is None:
+            return judged, kind
+        reason = self.lift(judged.q, judged.width)
+        return (replace(judged, rejected=reason), _UNLIFTED) if reason else (judged, kind)
+
+    def _lift(self) -> Callable[[Array, float], str]:
+        """Return a check of the lift at joint positions (J,) and a width [m], as plans of picks make it; "" is free."""
+        o, spheres = PickOptions(), target_spheres(self.s, self.target)
+        rows = rows_around(self.s.scene, self.target.rows)
+        rest = np.flatnonzero(~within(self.model.means.detach().double().numpy(), spheres))
+        field = self.s.collision_field(self.model.select(torch.from_numpy(rest)))
+        surfaces = Surfaces(self.s.scene, rows[rest])
+
+        def reason(q: Array, width: float) -> str:
+            found = lift_target(self.s, spheres, field, surfaces, q, width, lift_off=o.lift_off, height=o.lift)
+            return found if isinstance(found, str) else ""
+
+        return reason
 
     def _with_arm(self, grasp: Grasp, reach: ReachabilityCheck) -> tuple[Grasp, str]:
         reached = reach.reach(grasp.T_world_tcp, grasp.T_world_pregrasp, grasp.opening, grasp.width)
         if reached.q is None or reached.path is None:
-            return replace(grasp, rejected=reached.reason), reached.kind
+            surfaces = Surfaces(self.s.scene, rows_around(self.s.scene, self.target.rows))
+            reason = reached.reason if reached.blocked is None else f"{BLOCKED}: {surfaces.reason(reached.blocked)}"
+            return replace(grasp, rejected=reason), reached.kind
         found = _with_terms(grasp, arm_terms(reached))
         if reached.T_world_pregrasp is not None:
             found = replace(found, T_world_pregrasp=reached.T_world_pregrasp)

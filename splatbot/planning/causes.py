@@ -44,9 +44,8 @@ def collision(arm: RobotSpheres, field: GaussianCollisionField, q: Array) -> Cau
     link, row = int(nearest.link[0]), int(nearest.index[0])
     if link < 0:
         return Cause()
-    return Cause(
-        link, -1, row, -float(nearest.distance[0]), name=_moves(arm, link), at_base=_deepest(arm, field, q, link)
-    )
+    at_base, held = _deepest(arm, field, q, link)
+    return Cause(link, -1, row, -float(nearest.distance[0]), name=_moves(arm, link), at_base=at_base, held=held)
 
 
 def _moves(arm: RobotSpheres, link: int) -> str:
@@ -54,13 +53,18 @@ def _moves(arm: RobotSpheres, link: int) -> str:
     return arm.robot.chain.names[link - 1] if link > 0 else ""
 
 
-def _deepest(arm: RobotSpheres, field: GaussianCollisionField, q: Array, link: int) -> tuple[float, float, float]:
-    """Return the centre of the link's sphere that is deepest in the map at ``q`` (J,), in the base frame [m]."""
-    of = arm.spheres.link == link
+def _deepest(
+    arm: RobotSpheres, field: GaussianCollisionField, q: Array, link: int
+) -> tuple[tuple[float, float, float], bool]:
+    """Return the centre of the link's sphere that is deepest in the map at ``q`` (J,), in the base frame [m].
+
+    The second value is whether the sphere is of an object in the hand.
+    """
+    of = np.flatnonzero(arm.spheres.link == link)
     at = arm.centers(q[None])[0][of]
-    gap = field.clearance(at).distance - arm.spheres.radii[of]
-    x, y, z = transform_points(inverse(arm.T_world_base), at[int(np.argmin(gap))][None])[0]
-    return float(x), float(y), float(z)
+    k = int(np.argmin(field.clearance(at).distance - arm.spheres.radii[of]))
+    x, y, z = transform_points(inverse(arm.T_world_base), at[k][None])[0]
+    return (float(x), float(y), float(z)), bool(of[k] >= arm.own_count)
 
 
 def self_clearance(arm: RobotSpheres, q: Array) -> tuple[float, tuple[int, int]]:

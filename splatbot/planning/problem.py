@@ -82,6 +82,7 @@ class Cause:
         joint: index of the joint outside its limits, -1 if all are within; ``depth`` is then the excess [rad or m].
         name: name of that joint, or of the joint that moves the link; "" for the base.
         at_base: (3,) centre of the sphere that is deepest in the map, in the base frame [m]; None without one.
+        held: whether an object in the hand is in contact, and not the link that carries it.
     """
 
     link: int = -1
@@ -91,6 +92,7 @@ class Cause:
     joint: int = -1
     name: str = ""
     at_base: tuple[float, float, float] | None = None
+    held: bool = False
 
     def __str__(self) -> str:
         if self.joint >= 0:
@@ -99,14 +101,19 @@ class Cause:
         if self.link < 0:
             return "no obstacle is found"
         if self.other >= 0:
-            return f"{link_words(self.link, self.name)} touches link {self.other}, {1e3 * self.depth:.1f} mm deep"
+            return f"{self.part} touches link {self.other}, {1e3 * self.depth:.1f} mm deep"
         return f"{self.deep_in('the map')}, in Gaussian {self.gaussian}"
+
+    @property
+    def part(self) -> str:
+        """Return the words for the part of the arm in contact."""
+        return "the held object" if self.held else link_words(self.link, self.name)
 
     def deep_in(self, obstacle: str) -> str:
         """Describe the contact of the link with an obstacle, and its place."""
         at = "" if self.at_base is None else f" at {place_words(self.at_base)}"
         deep = f"{1e3 * max(self.depth, 0.0):.1f} mm deep"
-        return f"{link_words(self.link, self.name)} is {deep} in {obstacle}{at}"
+        return f"{self.part} is {deep} in {obstacle}{at}"
 
 
 def link_words(link: int, joint: str) -> str:

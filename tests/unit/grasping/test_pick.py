@@ -15,15 +15,15 @@ from splatbot.collision import RobotSpheres
 from splatbot.errors import GripperError, InputError
 from splatbot.gaussians import GaussianModel
 from splatbot.grasping.affordance import Target
-from splatbot.grasping.attached import covering_spheres
+from splatbot.grasping.attached import covering_spheres, within
 from splatbot.grasping.options import GraspOptions
 from splatbot.grasping.pick import Picker
-from splatbot.grasping.pick_planner import MapPickPlanner, PickPlan, within
+from splatbot.grasping.pick_planner import MapPickPlanner, PickPlan, Segment
 from splatbot.grasping.pick_types import PickError, PickOptions, PickOutcome, PickResult, PickStage
 from splatbot.grasping.sampler import GraspSampler
-from splatbot.grasping.types import GraspResult
-from splatbot.planning import GaussianRRTStar
-from splatbot.protocols import Gripper, MotionState
+from splatbot.grasping.types import Grasp, GraspResult
+from splatbot.planning import GaussianRRTStar, JointGoal
+from splatbot.protocols import Array, Gripper, MotionState
 from splatbot.robots.controllers import FakeController
 from splatbot.robots.grippers import FakeGripper, FakeRobotiq, RobotiqGripper
 from splatbot.robots.panda import panda
@@ -311,6 +311,31 @@ def test_a_target_without_a_plan_moves_nothing() -> None:
     assert result.reason
     np.testing.assert_array_equal(controller.position, at)
     assert gripper.opening() == gripper.stroke
+
+
+class Refusing:
+    """A planner that refuses each grasp, the second for a reason of its own."""
+
+    def __init__(self) -> None:
+        self.calls = 0
+
+    def plan_to(self, grasp: Grasp, start: Array, *, avoid_moving: bool = False) -> PickPlan | str:
+        self.calls += 1
+        return "it is too far" if self.calls == 2 else "it is blocked"
+
+    def plan_carry(self, plan: PickPlan, start: Array, goal: JointGoal) -> Segment | str:
+        raise NotImplementedError
+
+
+def test_grasps_refused_for_one_reason_share_its_line() -> None:
+    options = replace(OPTIONS, tries=3)
+    picker = Picker(
+        sampler(), FakeController(panda().home), FakeGripper(width=0.06), options=options,
+        make_planner=lambda _: Refusing(),
+    )  # fmt: skip
+    result = picker.pick(target("can"), grasps=grasps("can"))
+    assert result.reason == "grasp 0, 2: it is blocked; grasp 1: it is too far"
+    assert result.steps[0].note == f"{len(grasps('can').grasps)} grasps"
 
 
 def test_spheres_of_a_held_object_cover_it_and_are_few() -> None:

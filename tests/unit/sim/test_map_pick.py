@@ -8,6 +8,7 @@ import pytest
 
 from splatbot.geometry import quat_to_rotation
 from splatbot.grasping.pick_types import PickOutcome, PickResult, PickStage
+from splatbot.planning.problem import link_words
 from splatbot.protocols import Array
 from splatbot.sim.contact_monitor import ContactEvent, MinimumClearance
 from splatbot.sim.map_pick import CONSTANTS, TARGET, MapPick, _HeldStill, solid_shell
@@ -89,3 +90,13 @@ def test_the_outcome_is_picked_only_without_a_problem(
     pick = MapPick(result, rose, 0.15, contacts, MinimumClearance(0.3, 0.0), TwinRecording(Twin(scene).world), ())
     assert pick.outcome == verdict
     assert bool(pick) == (verdict == "picked") == (not pick.problems)
+
+
+def test_a_link_has_the_name_that_plans_give_it() -> None:
+    pick = MapPick(
+        PickResult(PickOutcome.PICKED, PickStage.CHECK, "", None, ()), 0.15, 0.15,
+        (ContactEvent("link5", "map", 1.0, 1.2, 0.002, 3.0),), MinimumClearance(0.3, 0.0),
+        TwinRecording(Twin(make_scene({"name": "arm"})).world), (),
+    )  # fmt: skip
+    assert pick.problems == (f"{link_words(5, 'panda_joint5')} touches map at 1.00 s, 2.0 mm deep",)
+    assert pick.words("finger1") == "finger1"

@@ -1,0 +1,109 @@
+"""The lift of a target, blocked approaches, and the words for them."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from splatbot.collision import GaussianCollisionField, RobotSpheres
+from splatbot.gaussians import GaussianModel
+from splatbot.grasping.advice import first_change
+from splatbot.grasping.affordance import Target
+from splatbot.grasping.lift import target_spheres
+from splatbot.grasping.options import GraspOptions
+from splatbot.grasping.reach import BLOCKED, BLOCKED_FAR, BLOCKED_NEAR, ArmReach
+from splatbot.grasping.sampler import GraspSampler
+from splatbot.grasping.types import FITTING, GraspResult
+from splatbot.planning.causes import collision
+from splatbot.protocols import Array
+from splatbot.report.sphere_gaussians import sphere_gaussians
+from splatbot.robots.panda import panda
+from splatbot.segmentation import SegmentedMap
+from tests.unit.grasping.objects import BOX, scene, target_of
+
+
+def ball(at: Array, radius: float) -> GaussianModel:
+    return sphere_gaussians(at[None], np.array([radius]), np.array([0.5, 0.5, 0.5]), 0.99)
+
+
+def with_touching_ball(at: Array) -> SegmentedMap:
+    """Return the table with a fixed ball of 8 mm at a place, which no object owns."""
+    model = GaussianModel.concatenate([scene().model, ball(at, 0.008)])
+    return replace(scene(), model=model, labels=np.r_[scene().labels, np.int32(-1)].astype(np.int32))
+
+
+def test_grasps_that_plans_cannot_lift_are_not_offered_and_the_reason_names_the_held_object() -> None:
+    """A ball at the end of the long side of the box reaches 6 mm into the spheres that cover the box."""
+    long_side = np.array([np.cos(0.4), np.sin(0.4), 0.0])
+    few, target = GraspOptions(samples=100), target_of(scene(), BOX, "box")
+    spheres = target_spheres(GraspSampler(scene(), panda()), target)
+    out = np.array([0.45, 0.10, 0.09]) + np.linspace(0.05, 0.09, 81)[:, None] * long_side
+    gap = (np.linalg.norm(out[:, None] - spheres[None, :, :3], axis=2) - spheres[:, 3]).min(axis=1)
+    at = out[np.argmax(gap > 0.002)]
+    touched = with_touching_ball(at)
+    sampler = GraspSampler(touched, panda())
+    assert sampler.sample(target, few).grasps
+    sampler.agree_with_plans(GaussianCollisionField(GaussianModel.empty(0), 2.0))
+    result = sampler.sample(target, few)
+    assert not result.grasps
+    assert result.rejected[FITTING + "cannot lift the target"] > 0
+    reason, change = first_change(result, touched, 0.08)
+    assert reason.startswith("it cannot be lifted: 30 mm up, at the start the held object is")
+    assert "deep in Gaussians without a label at" in reason
+    assert "move that neighbour away" in change
+    place = np.array([float(x) for x in re.findall(r"-?\d\.\d\d(?=[,)])", reason)])
+    assert np.linalg.norm(place - at) < 0.05
+
+
+def test_a_contact_of_the_attached_object_is_not_that_of_the_last_link() -> None:
+    arm, q = panda(), np.asarray(panda().home)
+    loaded = RobotSpheres(arm, attached=[[0.0, 0.0, 0.3, 0.02]])
+    at = loaded.centers(q[None])[0][-1]
+    held = str(collision(loaded, GaussianCollisionField(ball(at, 0.005)), q))
+    assert held.startswith("the held object is 2")  # 20 mm of its sphere and 5 mm of the ball
+    wrist = loaded.centers(q[None])[0][np.flatnonzero(loaded.spheres.link == 7)[0]]
+    assert str(collision(loaded, GaussianCollisionField(ball(wrist, 0.005)), q)).startswith("link 7 (after ")
+
+
+@pytest.mark.parametrize(("low", "high", "kind"), [(0.0, 0.04, BLOCKED_NEAR), (0.06, 0.10, BLOCKED_FAR)])
+def test_a_shorter_approach_is_advised_only_where_the_obstacle_is_beyond_it(low: float, high: float, kind: str) -> None:
+    """A ball of 1 mm lies where a sphere of the hand enters between two distances on the way back."""
+    T = np.diag([1.0, -1.0, -1.0, 1.0])
+    T[:3, 3] = (0.5, 0.0, 0.3)
+    above = T.copy()
+    above[2, 3] += 0.1
+    free = ArmReach(panda(), np.eye(4), GaussianCollisionField(GaussianModel.empty(0)))
+    found = free.reach(T, above, 0.08, 0.06)
+    assert found.path is not None
+    arm, way = free.arm(0.08), found.path[::-1]
+    back = np.linspace(0.0, 0.1, len(way))
+    centers, radii = arm.centers(way), arm.spheres.radii
+    before, then = np.flatnonzero(back <= low), np.flatnonzero((back > low) & (back <= high))
+    tops = centers[then[-1]] + radii[:, None] * [0.0, 0.0, 0.98]
+    gap = np.linalg.norm(tops[None, :, None] - centers[before][:, None], axis=3) - radii
+    of_hand = arm.spheres.link == 7  # it moves alike in all postures
+    best = int(np.argmax(np.where(of_hand, gap.min(axis=(0, 2)), -np.inf)))
+    assert gap[:, best].min() > 0.003
+    blocked = ArmReach(panda(), np.eye(4), GaussianCollisionField(ball(tops[best], 0.001))).reach(T, above, 0.08, 0.06)
+    assert blocked.q is None
+    assert blocked.kind == kind
+    target = target_of(scene(), BOX, "box")
+    some = GraspSampler(scene(), panda(), hand_only=True).sample(target, GraspOptions(samples=50))
+    shown = replace(some.grasps[0], rejected=blocked.reason)
+    reason, change = first_change(
+        replace(some, grasps=(), doubtful=(), rejected={FITTING + kind: 3}, best_rejected=shown), scene(), 0.08
+    )
+    assert reason == blocked.reason
+    assert reason.startswith(BLOCKED)
+    assert ("--pregrasp 0.05" in change) == (kind == BLOCKED_FAR)
+
+
+def test_the_size_of_the_whole_cluster_is_no_reason_against_a_marked_part_of_it() -> None:
+    number, whole = next((o.number, o.rows) for o in scene().objects if o.size[1] > 0.1)
+    part = Target(whole[: len(whole) // 3], None, "part", "place", 1.0, (), number)
+    result = GraspResult(part, (), {FITTING + "cannot lift the target": 2}, None, 2, {}, map_version=0)
+    assert first_change(result, scene(), 0.08)[0] == "it cannot be lifted"
+    assert "apart" in first_change(replace(result, target=replace(part, rows=whole)), scene(), 0.08)[0]
