@@ -126,7 +126,10 @@ def plan_pick(
     return 0
 
 
-_HINT = "try another grasp (`--grasp-index`), or map the scene from more sides"
+_HINT = (
+    "try another grasp (`--grasp-index`), mark the target alone where objects touch (`splatbot grasp --mask`), "
+    "or map the scene from more sides"
+)
 
 
 def _base(map_: Path, known: GraspFile) -> Pose | None:

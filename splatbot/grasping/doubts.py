@@ -2,12 +2,52 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from splatbot.grasping.measured import CONSTANTS
 from splatbot.grasping.options import GraspOptions
 from splatbot.grasping.types import Grasp
-from splatbot.protocols import HandShape
+from splatbot.protocols import Array, HandShape
+
+
+@dataclass(frozen=True)
+class PartConstants:
+    """Constants of grasps of a part of a larger cluster.
+
+    Args:
+        beyond: [m] distance outside of the pads, along their closing direction, from which a point is beyond them.
+        share: share of the target's surface beyond the pads from which the hand closes on a part of it.
+    """
+
+    beyond: float = 0.01
+    share: float = 0.1
+
+
+PART = PartConstants()
+
+
+def part_note(grasp: Grasp, points: Array) -> str:
+    """Return a note if the hand closes on a part of the target: much of its surface is outside of the pads.
+
+    A point with the coordinate t along the closing direction, from the middle of the contacts, is beyond the pads if
+    ``|t| > width / 2 + 1 cm``.
+
+    Args:
+        grasp: the grasp.
+        points: (P, 3) on the surface of the target [m, world].
+    """
+    along = grasp.contacts[1] - grasp.contacts[0]
+    t = (points - grasp.contacts.mean(axis=0)) @ (along / np.linalg.norm(along))
+    outside = np.abs(t) - grasp.width / 2
+    share = float((outside > PART.beyond).mean())
+    if share < PART.share:
+        return ""
+    return (
+        f"The first grasp closes on a part of the target: {share:.0%} of its surface is beyond the pads, up to "
+        f"{1e3 * outside.max():.0f} mm. If objects touch there, mark the one to take in images of the run (--mask)."
+    )
 
 
 def doubt(grasp: Grasp, options: GraspOptions, hand: HandShape) -> str:

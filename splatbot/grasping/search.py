@@ -17,7 +17,7 @@ from splatbot.gaussians import GaussianModel
 from splatbot.grasping.affordance import Target
 from splatbot.grasping.antipodal import Pairs, PairSearch, antipodal_pairs
 from splatbot.grasping.attached import object_spheres, within
-from splatbot.grasping.doubts import doubt
+from splatbot.grasping.doubts import doubt, part_note
 from splatbot.grasping.hands import CONSTANTS as HANDS
 from splatbot.grasping.hands import Hands, measure_hands, palm_free, place_hands, usable_opening
 from splatbot.grasping.lift import lift_target, target_spheres
@@ -490,6 +490,8 @@ class Search:
                     f"The best grasp is {100 * away:.0f} cm from the indicated point. If it is on another object, both "
                     "are connected in the map; a mask separates them."
                 )
+        if grasps and (part := part_note(grasps[0], self.surface.points)):
+            notes.append(part)
         completed = float(1.0 - self.surface.observed.mean())
         if completed > 0.05:
             notes.append(f"{completed:.0%} of its surface was not observed and is completed.")

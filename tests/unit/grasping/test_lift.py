@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from splatbot.bench.tabletop import Block
 from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.gaussians import GaussianModel
 from splatbot.grasping.advice import first_change
@@ -21,8 +22,8 @@ from splatbot.planning.causes import collision
 from splatbot.protocols import Array
 from splatbot.report.sphere_gaussians import sphere_gaussians
 from splatbot.robots.panda import panda
-from splatbot.segmentation import SegmentedMap
-from tests.unit.grasping.objects import BOX, scene, target_of
+from splatbot.segmentation import SegmentedMap, segment
+from tests.unit.grasping.objects import BOX, colored, scene, target_of
 
 
 def ball(at: Array, radius: float) -> GaussianModel:
@@ -99,6 +100,27 @@ def test_a_shorter_approach_is_advised_only_where_the_obstacle_is_beyond_it(low:
     assert reason == blocked.reason
     assert reason.startswith(BLOCKED)
     assert ("--pregrasp 0.05" in change) == (kind == BLOCKED_FAR)
+
+
+def test_a_hand_that_closes_on_one_of_two_touching_boxes_is_noted() -> None:
+    """A box of 6 cm touches one of 14 cm, as one cluster: the hand takes the narrow one."""
+    narrow, wide = Block((0.45, 0.10, 0.05), (0.06, 0.06, 0.10)), Block((0.45, 0.20, 0.05), (0.14, 0.14, 0.10))
+    both = segment(colored({"narrow": narrow, "wide": wide}, 10_000, {}), np.eye(4))
+    cluster = max(both.objects, key=lambda item: len(item.rows))
+    assert cluster.size[0] > 0.19
+    sampler, few = GraspSampler(both, panda(), hand_only=True), GraspOptions(samples=100, wanted=3)
+    result = sampler.sample(Target(cluster.rows, None, "both", "place", 1.0, (), cluster.number), few)
+    noted = [note for note in result.notes if "closes on a part of the target" in note]
+    assert len(noted) == 1
+    assert "--mask" in noted[0]
+    first = result.grasps[0]
+    along = (first.contacts[1] - first.contacts[0]) / np.linalg.norm(first.contacts[1] - first.contacts[0])
+    corners = np.array([[x, y, z] for x in (0.38, 0.52) for y in (0.13, 0.27) for z in (0.0, 0.10)])
+    farthest = np.abs((corners - first.contacts.mean(axis=0)) @ along).max() - first.width / 2
+    assert abs(float(re.findall(r"up to (\d+) mm", noted[0])[0]) - 1e3 * farthest) < 8.0
+    alone = GraspSampler(scene(), panda(), hand_only=True).sample(target_of(scene(), BOX, "box"), few)
+    assert alone.grasps
+    assert not any("closes on a part" in note for note in alone.notes)
 
 
 def test_the_size_of_the_whole_cluster_is_no_reason_against_a_marked_part_of_it() -> None:
