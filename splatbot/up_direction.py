@@ -59,12 +59,14 @@ class WorkspaceEstimate:
         decided_by: source of the up direction.
         doubts: reasons against the estimate; without any, it may be used.
         others: other candidates.
+        directions: (3,) usual upward directions with a surface that faces them.
     """
 
     workspace: Workspace
     decided_by: str
     doubts: tuple[str, ...] = ()
     others: tuple[Workspace, ...] = ()
+    directions: tuple[Array, ...] = ()
 
 
 def estimate_workspace(
@@ -90,25 +92,31 @@ def estimate_workspace(
     if up is not None:
         found = fit_workspace(model, up=up, seed=seed)
         return WorkspaceEstimate(found, decided_by, tuple(_doubts_of_support(found, points)))
-    found, *others = _candidates(model, seed)
+    (found, *others), directions = _candidates(model, seed)
     doubts = [*_doubts_of_view(found), *_doubts_of_support(found, points)]
     if others:
         angles = ", ".join(f"{_angle(found, other):.0f}°" for other in others)
         doubts.append(f"other planes with objects on them are turned by {angles}")
-    return WorkspaceEstimate(found, "estimated", tuple(doubts), tuple(others))
+    return WorkspaceEstimate(found, "estimated", tuple(doubts), tuple(others), directions)
 
 
-def _candidates(model: GaussianModel, seed: int) -> list[Workspace]:
-    """Return different planes that can be supports, that with most points on it first; weak rivals are left out."""
+def _candidates(model: GaussianModel, seed: int) -> tuple[list[Workspace], tuple[Array, ...]]:
+    """Return different planes that can be supports, that with most points on it first, and the directions with one.
+
+    Weak rivals are left out.
+    """
     points = model.means.double().numpy()
     found: list[tuple[int, Workspace]] = []
+    directions: list[Array] = []
     failure: InputError | None = None
     for pitch in np.radians(CONSTANTS.pitches):
+        up = np.array([0.0, -np.cos(pitch), -np.sin(pitch)])
         try:
-            place = fit_workspace(model, up=(0.0, -np.cos(pitch), -np.sin(pitch)), seed=seed)
+            place = fit_workspace(model, up=up, seed=seed)
         except InputError as error:
             failure = error
             continue
+        directions.append(up)
         looks_up = _normal(place)[1] > np.sin(np.radians(CONSTANTS.max_upward_look))
         if looks_up or any(_angle(place, other) < CONSTANTS.same_plane for _, other in found):
             continue
@@ -118,7 +126,7 @@ def _candidates(model: GaussianModel, seed: int) -> list[Workspace]:
         raise failure or InputError("has no upward surface.", field="map", hint="give the up direction: --up X Y Z")
     found.sort(key=lambda pair: -pair[0])
     least = max(CONSTANTS.rival * found[0][0], 1.0)
-    return [found[0][1], *(place for surplus, place in found[1:] if surplus >= least)]
+    return [found[0][1], *(place for surplus, place in found[1:] if surplus >= least)], tuple(directions)
 
 
 def support_counts(place: Workspace, points: Array) -> tuple[int, int, int]:
@@ -140,7 +148,7 @@ def _doubts_of_support(place: Workspace, points: Array) -> Sequence[str]:
     if standing < CONSTANTS.min_standing * on:
         return ["nothing stands on the plane, so it is perhaps no table or floor"]
     if beneath > CONSTANTS.max_beneath * standing:
-        return [f"{beneath} points are beneath the plane and {standing} above it, so it supports nothing"]
+        return [f"{beneath} points are beneath the plane and {standing} above it, so it is perhaps no support"]
     return []
 
 

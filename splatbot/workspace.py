@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +35,7 @@ _KEYS = (
     "joint_delay",
     "joint_names",
     "tf_prefix",
+    "base_proposed",
 )
 
 
@@ -94,6 +95,7 @@ class Workspace:
         joint_delay: time [s] by which the stamps of measured joint positions are later than the motion.
         joint_names: (J,) names of the robot's joints in recordings, if they are not those of its model.
         tf_prefix: prefix of the names of the robot's links in TF, as ``left_``.
+        base_proposed: whether the base is a proposal of :func:`fit_workspace`, and not that of a real robot.
 
     Raises:
         InputError: a value has a wrong shape, is not finite, or is no rigid pose, no unit vector, no prefix or an empty
@@ -112,6 +114,7 @@ class Workspace:
     joint_delay: float = 0.0
     joint_names: tuple[str, ...] = ()
     tf_prefix: str = ""
+    base_proposed: bool = False
 
     def __post_init__(self) -> None:
         _check("T_world_base", self.T_world_base, (4, 4), "a pose")
@@ -138,6 +141,8 @@ class Workspace:
         if not isinstance(self.tf_prefix, str) or self.tf_prefix.startswith("/") or len(self.tf_prefix) > MAX_PREFIX:
             hint = f"give at most {MAX_PREFIX} characters without a leading slash, as left_ or left/"
             raise InputError(f"is {str(self.tf_prefix)[:40]!r}.", field="tf_prefix", hint=hint)
+        if not isinstance(self.base_proposed, bool):
+            raise InputError(f"is {self.base_proposed!r}.", field="base_proposed", hint="give true or false")
         if not isinstance(self.camera_link, int) or isinstance(self.camera_link, bool):
             raise InputError(
                 f"is {self.camera_link!r}.", field="camera_link", hint="give a link's number, -1: the last"
@@ -171,9 +176,25 @@ class Workspace:
                 joint_delay=_number(found.get("joint_delay", 0.0), "joint_delay"),
                 joint_names=_names(found.get("joint_names", [])),
                 tf_prefix=found.get("tf_prefix", ""),
+                base_proposed=found.get("base_proposed", False),
             )
         except InputError as error:
             raise FormatError(error.message, file=path, field=error.field, hint=error.hint) from error
+
+    def with_base_moved(self, offset: ArrayLike) -> Workspace:
+        """Return the workspace with the base moved by ``offset`` (3,) [m] along its own axes; the box stays in place.
+
+        Raises:
+            InputError: the base is unknown, or the offset is not three finite numbers.
+        """
+        moved = np.asarray(offset, dtype=np.float64)
+        _check("base offset", moved, (3,), "three numbers")
+        if self.T_world_base is None:
+            raise InputError("is not known.", field="T_world_base", hint="propose one: splatbot info RUN --fit-plane")
+        T = self.T_world_base.copy()
+        T[:3, 3] += T[:3, :3] @ moved
+        box = None if self.box is None else self.box - moved
+        return replace(self, T_world_base=T, box=box, base_proposed=False)
 
     def save(self, path: str | Path) -> None:
         """Write a YAML file; unknown fields are omitted."""
@@ -197,6 +218,8 @@ class Workspace:
             document["joint_names"] = list(self.joint_names)
         if self.tf_prefix:
             document["tf_prefix"] = self.tf_prefix
+        if self.base_proposed:
+            document["base_proposed"] = True
         if self.objects:
             document["objects"] = [
                 {"name": o.name, "at": _plain(o.at)} | ({"aliases": list(o.aliases)} if o.aliases else {})
@@ -272,7 +295,19 @@ def fit_workspace(model: GaussianModel, *, up: ArrayLike = (0.0, -1.0, 0.0), see
         on = points[np.abs(points @ best[:3] + best[3]) < CONSTANTS.inlier_distance]
         middle = on.mean(axis=0)
         best = _planes(np.linalg.svd(on - middle, full_matrices=False)[2][2:], middle[None], upward)[0]
-    return _around(best, points[np.abs(points @ best[:3] + best[3]) < CONSTANTS.inlier_distance])
+    return workspace_on(best, points)
+
+
+def workspace_on(plane: Array, points: Array) -> Workspace:
+    """Propose a base and a workspace on a plane (4,), as (n, d) with n upwards, from the points (N, 3) on it [m].
+
+    Raises:
+        InputError: no point is on the plane.
+    """
+    on = points[np.abs(points @ plane[:3] + plane[3]) < CONSTANTS.inlier_distance]
+    if not len(on):
+        raise InputError("has no points on it.", field="plane", hint="take a plane of the map")
+    return _around(plane, on)
 
 
 def _planes(normals: Array, points: Array, up: Array) -> Array:
@@ -297,7 +332,7 @@ def _around(plane: Array, on: Array) -> Workspace:
     local = transform_points(np.linalg.inv(T), on)
     low, high = np.percentile(local, [1, 99], axis=0)
     box = np.array([[low[0], low[1], 0.0], [high[0], high[1], CONSTANTS.height]])
-    return Workspace(T, -up, plane, box)
+    return Workspace(T, -up, plane, box, base_proposed=True)
 
 
 def _check(name: str, value: Array | None, shape: tuple[int, ...], meaning: str) -> None:

@@ -373,6 +373,7 @@ def _completed(
         joint_offsets=offsets if offsets.any() else None,
         offsets_of=arm_name(arm.name) if arm is not None and offsets.any() else "",
         T_world_base=inverse(found.T_base_static) if tracked else scene.T_world_base,
+        base_proposed=scene.base_proposed and not tracked,
         joint_delay=_joint_delay(found, scene.joint_delay) if tracked and arm is not None else scene.joint_delay,
     )
 

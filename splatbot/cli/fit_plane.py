@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from splatbot.cli.tables import print_table
+from splatbot.cli.tables import print_table, print_text
 
 if TYPE_CHECKING:
     from splatbot.gaussians import GaussianModel
@@ -16,13 +16,14 @@ if TYPE_CHECKING:
 Up = tuple[float, float, float]
 
 
-def fit_plane(map_file: Path, up: Up | None) -> int:
+def fit_plane(map_file: Path, up: Up | None, support: int | None, base_offset: Up | None) -> int:
     """Describe the workspace next to a map, or estimate and write it with a picture; return the exit code.
 
-    ``up`` overrides an existing scene.yaml. An estimate with doubts is not written.
+    ``up`` overrides an existing scene.yaml. An estimate with doubts is not written. ``support`` proposes the base on
+    another support of the segmented map, and ``base_offset`` (3,) [m] moves it along its own axes.
 
     Raises:
-        InputError: the map has no upward surface.
+        InputError: the map has no upward surface, or no such support.
         FormatError: the map or a scene.yaml is damaged.
     """
     from splatbot.gaussians import GaussianModel
@@ -31,30 +32,67 @@ def fit_plane(map_file: Path, up: Up | None) -> int:
     target = map_file.with_name(NAME)
     known = find_workspace(map_file)
     model = GaussianModel.load(map_file)
+    notes: list[tuple[str, str]] = []
     if known is not None and up is None:
-        print_table([("from", "the file"), *_rows(known)], title=str(target))
-        _draw(model, known, map_file)
-        return 0
-    found = _estimate(map_file, model, up)
-    if found.doubts and up is None:
-        _ask(found, map_file)
-        _draw(model, found.workspace, map_file)
-        return 1
-    place = found.workspace
-    if known is not None:
-        place = replace(
-            known,
-            T_world_base=place.T_world_base,
-            gravity=place.gravity,
-            support_plane=place.support_plane,
-            box=place.box,
-        )
-    place.save(target)
-    notes = [("note", doubt) for doubt in found.doubts]
-    how = f"{found.decided_by}, {'replaced' if known is not None else 'written'}"
+        place, how = known, "the file"
+    else:
+        found = _estimate(map_file, model, up)
+        if found.doubts and up is None:
+            _ask(found, map_file)
+            _draw(model, found.workspace, map_file)
+            return 1
+        place, how = found.workspace if known is None else _with_support(known, found.workspace), found.decided_by
+        notes = [("note", doubt) for doubt in found.doubts]
+        if notes:
+            notes.append(("note", f"the plane is used, because {found.decided_by} gives the direction"))
+    if support is not None:
+        place, how = _with_support(place, _on_support(model, place, support)), f"support {support} of the map"
+    if base_offset is not None:
+        place, how = place.with_base_moved(base_offset), f"{how}, with the base moved"
+    if place is not known:
+        place.save(target)
+        how = f"{how}, {'replaced' if known is not None else 'written'}"
     print_table([("from", how), *_rows(place), *notes], title=str(target))
     _draw(model, place, map_file)
     return 0
+
+
+def _with_support(known: Workspace, found: Workspace) -> Workspace:
+    """Return a workspace with the plane, the base and the box of another one."""
+    return replace(
+        known,
+        T_world_base=found.T_world_base,
+        gravity=found.gravity,
+        support_plane=found.support_plane,
+        box=found.box,
+        base_proposed=found.base_proposed,
+    )
+
+
+def _on_support(model: GaussianModel, place: Workspace, number: int) -> Workspace:
+    """Propose a base on a support of the map, by its number in `splatbot objects`.
+
+    Raises:
+        InputError: the base is unknown, or the map has no such support.
+    """
+    import numpy as np
+
+    from splatbot.errors import InputError
+    from splatbot.gaussians import Snapshot
+    from splatbot.segmentation import segment
+    from splatbot.workspace import workspace_on
+
+    T = place.T_world_base
+    if T is None:
+        raise InputError("needs a base.", field="--support", hint="leave it out once, to propose a base on the plane")
+    supports = segment(Snapshot(model, map_version=0), T, box=place.box, plane=place.support_plane).supports
+    if not 0 <= number < len(supports):
+        heights = ", ".join(f"{k} at {1e3 * each.offset:+.0f} mm" for k, each in enumerate(supports))
+        hint = f"heights above the base: {heights}" if supports else "give --up X Y Z"
+        raise InputError(f"is {number}, of {len(supports)} supports.", field="--support", hint=hint)
+    normal = T[:3, :3] @ supports[number].normal
+    plane = np.array([*normal, -(supports[number].offset + normal @ T[:3, 3])])
+    return workspace_on(plane, model.means.double().numpy())
 
 
 def _estimate(map_file: Path, model: GaussianModel, up: Up | None) -> WorkspaceEstimate:
@@ -87,11 +125,11 @@ def _ask(found: WorkspaceEstimate, map_file: Path) -> None:
     places = (found.workspace, *found.others)
     rows += [(f"candidate {number}", _candidate(place)) for number, place in enumerate(places, 1)]
     print_table(rows, title="the up direction is doubtful; nothing is written")
-    print("say which is up in the first camera (x right, y down, z ahead), for example one of:")
-    for place in places:
-        assert place.support_plane is not None
-        x, y, z = place.support_plane[:3]
-        print(f"  splatbot info {map_file.parent} --fit-plane --up {x:.3f} {y:.3f} {z:.3f}")
+    print_text("say which is up in the first camera (x right, y down, z ahead), one of:")
+    normals = [place.support_plane[:3] for place in places if place.support_plane is not None]
+    for up in (*normals, *found.directions):
+        x, y, z = (round(float(value), 3) + 0.0 for value in up)
+        print(f"  splatbot info {map_file.parent} --fit-plane --up {x:g} {y:g} {z:g}")
 
 
 def _candidate(place: Workspace) -> str:

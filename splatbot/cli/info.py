@@ -42,6 +42,8 @@ def info(
     camera: Annotated[str | None, tyro.conf.arg(metavar="PRESET|FILE")] = None,
     fit_plane: bool = False,
     up: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None,
+    support: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
+    base_offset: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None,
     picture: Annotated[Path | None, tyro.conf.arg(metavar="PNG")] = None,
 ) -> int:
     """Describe a map, a log or a run.
@@ -58,6 +60,7 @@ def info(
         splatbot info runs/latest
         splatbot info map.ply
         splatbot info runs/latest --fit-plane
+        splatbot info runs/latest --fit-plane --base-offset -0.2 0.4 0.6
 
     Args:
         path: a map file, a run folder (its map), a tiled map, synthetic:SCENE, or a recording. Folders are of TUM,
@@ -68,12 +71,17 @@ def info(
         up: with --fit-plane, upwards in the first camera (x right, y down, z ahead). It is 0 -1 0 for a camera that
             looked ahead, and 0 0 -1 for one that looked straight down. It replaces an existing estimate. By default
             the log's accelerometer decides, if there is one, else the planes of the map.
+        support: with --fit-plane, propose the base on this support of `splatbot objects`, which lists heights; the
+            first one is 0.
+        base_offset: with --fit-plane, move the base along its own axes [m] (x ahead, y left, z up), as for a robot on a
+            pedestal. Each call moves it further.
         picture: write colour and depth of the log's first frame, side by side.
     """
     from splatbot.cli.fit_plane import fit_plane as fit_plane_command
 
-    if up is not None and not fit_plane:
-        raise InputError("goes with --fit-plane.", field="--up", hint="give both")
+    for flag, given in (("--up", up), ("--support", support), ("--base-offset", base_offset)):
+        if given is not None and not fit_plane:
+            raise InputError("goes with --fit-plane.", field=flag, hint="give both")
     if is_tiled_map(path):
         return _describe_tiled(path, fit_plane=fit_plane, picture=picture)
     if is_map(path):
@@ -81,7 +89,7 @@ def info(
             raise InputError("needs a log.", field="--picture", hint=f"splatbot render {path}")
         place = map_file(path)
         print_table(describe_map(place), title=str(place))
-        return fit_plane_command(place, up) if fit_plane else 0
+        return fit_plane_command(place, up, support, base_offset) if fit_plane else 0
     log_kind(path)
     check_camera(camera)
     if fit_plane:

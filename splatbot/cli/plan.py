@@ -122,7 +122,7 @@ def plan(
     from splatbot.collision import GaussianCollisionField, RobotSpheres
     from splatbot.gaussians import GaussianModel
     from splatbot.grasping.grasp_file import GraspFile
-    from splatbot.planning import GaussianRRTStar, PoseGoal
+    from splatbot.planning import GaussianRRTStar, PlanningError, PlanStatus, PoseGoal
     from splatbot.planning.closest import closest_approach
     from splatbot.report.plan_page import plan_html, plan_png
     from splatbot.robots.appearance import appearance, coarse_appearance
@@ -166,7 +166,14 @@ def plan(
     if result.path is None:
         _draw_refusal(folder / "refused.png", model, around, arm, found.planner, result, here, wanted)
     around.check(result)
-    result.unwrap()
+    try:
+        result.unwrap()
+    except PlanningError as refused:
+        scene = find_workspace(map)
+        if result.status is PlanStatus.START_STATE_IN_COLLISION and base is None and scene and scene.base_proposed:
+            correct = f"splatbot info {map} --fit-plane --base-offset X Y Z"
+            refused.hint = f"{refused.hint}; or correct the base, which is only proposed: {correct}"
+        raise
     assert trajectory is not None
     covers = found.scope(around, confidence=confidence)
     nearest = closest_approach(found.planner.arm, found.planner.field, trajectory, around.kind)

@@ -81,6 +81,18 @@ def test_a_file_that_is_no_json_and_two_goals_are_refused(run: RunCommand, map_f
     assert_refused(run(*words), "must be given, one of them")
 
 
+@pytest.mark.parametrize("proposed", [True, False])
+def test_a_start_in_collision_names_the_correction_of_a_base_that_is_only_proposed(
+    run: RunCommand, map_file: Path, tmp_path: Path, proposed: bool
+) -> None:
+    base = np.eye(4)
+    base[2, 3] = -0.4  # below the table
+    Workspace(T_world_base=base, base_proposed=proposed).save(tmp_path / "scene.yaml")
+    answer = run("plan", "--map", map_file, "--start", "home", "--goal", *GOAL, "--out", tmp_path / "out")
+    assert_refused(answer, "mm deep in")
+    assert (f"correct the base, which is only proposed: splatbot info {map_file}" in answer.err) == proposed
+
+
 @pytest.mark.parametrize(
     "goal",
     [("--goal", 0.0, 0.9, 0.0, -1.9, 0.0, 2.8, 0.8), ("--goal-pose", 0.5, 0.0, -0.05, 0, 1, 0, 0)],
