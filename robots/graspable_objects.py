@@ -10,9 +10,9 @@ import torch
 from numpy.typing import ArrayLike
 
 from splatbot.collision import RobotSpheres
-from splatbot.collision.visibility import DepthView, gather_evidence
+from splatbot.collision.visibility import DepthView
 from splatbot.errors import SplatbotError
-from splatbot.gaussians import GaussianModel, Snapshot
+from splatbot.gaussians import Snapshot
 from splatbot.grasping.measured import CONSTANTS as MEASURED
 from splatbot.grasping.measured import RawDepth
 from splatbot.grasping.object_list import ListedObject, list_objects
@@ -22,11 +22,12 @@ from splatbot.protocols import Array, RobotKinematics
 from splatbot.results.folder import RunFolder
 from splatbot.results.margin import CONSTANTS as MARGIN
 from splatbot.results.margin import AuditedError
+from splatbot.results.objects import segment_workspace, unseen_through
 from splatbot.results.observers import observers
 from splatbot.results.plan_obstacles import support_tiles
 from splatbot.results.views import raw_views, subsampled_views
 from splatbot.robots.in_view import reopen_log
-from splatbot.segmentation import SegmentedMap, segment
+from splatbot.segmentation import SegmentedMap
 from splatbot.workspace import Workspace
 
 
@@ -114,7 +115,7 @@ def measured_map(state: Snapshot, run: RunFolder | None) -> MeasuredMap:
         name = f"{Path(error.file).name}: " if error.file else ""  # without the private path of the folder
         reason = f"the run's log cannot be read: {name}{error.message}"
         notes = (f"Visibility was not checked, because {reason}",)
-    model = _solid(state.model, views)
+    model = state.model.select(torch.from_numpy(unseen_through(state.model, views)))
     return MeasuredMap(replace(state, model=model), observers(run, model), views, raw, notes)
 
 
@@ -132,20 +133,5 @@ def segment_objects(
     Raises:
         InputError: the box contains no Gaussians.
     """
-    own = workspace if as_known else None
-    scene = segment(
-        measured.state,
-        T_world_base,
-        box=own.box if own is not None else None,
-        plane=own.support_plane if own is not None else None,
-        names=workspace.objects if workspace is not None else (),
-        observers=measured.observers,
-    )
+    scene = segment_workspace(measured.state, T_world_base, workspace, as_known=as_known, observers=measured.observers)
     return GraspableObjects(measured, scene)
-
-
-def _solid(model: GaussianModel, views: tuple[DepthView, ...]) -> GaussianModel:
-    """Remove Gaussians with more passes than hits; without views the model is unchanged."""
-    if not views:
-        return model
-    return model.select(torch.from_numpy(~gather_evidence(model, views).seen_through).nonzero()[:, 0])

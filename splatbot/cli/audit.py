@@ -71,7 +71,7 @@ def _print(run: Path, found: RunAudit, summary: dict[str, Any]) -> None:
     print_table(verdict_rows(summary), title=str(run))
     for title, rows in (
         ("by distance from the camera: points, missed, error of 99.9 %", distance_rows(summary)),
-        ("by object: points, missed, largest error", object_rows(summary)),
+        ("by object (numbers of splatbot objects): points, missed, largest error", object_rows(summary)),
         ("largest holes: length x width, depth, centre [m]", hole_rows(summary)),
     ):
         if rows:

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from splatbot.grasping.sampler import GraspSampler
     from splatbot.grasping.types import GraspResult
     from splatbot.robots.graspable_objects import GraspableObjects
+    from splatbot.segmentation import SegmentedMap
 
 
 def grasp(
@@ -181,7 +182,7 @@ def grasp(
         why = " ".join(note for note in found.notes if note.startswith("took "))
         raise SplatbotError(f"cannot be grasped: {reason}. {why}".strip(), field=found.label, hint=change)
     result.unwrap()
-    _print(result, folder, margin_text, verbose=verbose)
+    _print(result, scene, folder, margin_text, verbose=verbose)
     if not hand_only:
         print_command(f"splatbot plan-pick --map {map} --grasp {folder / 'grasp.json'} --start home")
     return 0
@@ -306,15 +307,27 @@ def _set_margin(sampler: GraspSampler, margin: str | None, map_: Path, target: T
     return f"0, so that errors of the map are not covered; {hand}"
 
 
-def _print(result: GraspResult, folder: Path, margin: str, *, verbose: bool) -> None:
+def _place(target: Target, scene: SegmentedMap) -> str:
+    """Describe the size of a target, if it is a whole object, and the middle of its bounding box from the base."""
+    from splatbot.planning.problem import place_words
+
+    points = scene.points[target.rows]
+    known = scene.objects[target.number] if 0 <= target.number < len(scene.objects) else None
+    whole = known is not None and len(known.rows) == len(points)
+    size = "×".join(f"{1e3 * x:.0f}" for x in known.size) + " mm, " if known is not None and whole else ""
+    return f"{size}at {place_words((points.min(axis=0) + points.max(axis=0)) / 2)}"
+
+
+def _print(result: GraspResult, scene: SegmentedMap, folder: Path, margin: str, *, verbose: bool) -> None:
     from rich.table import Table
 
     from splatbot.cli.tables import print_columns, print_table, print_text
 
     target = result.target
+    taken = f"{target.label}, {len(target.rows)} Gaussians, by {target.backend} ({target.score:.2f})"
     seconds = sum(result.seconds.values())
     rows = [
-        ("target", f"{target.label}, {len(target.rows)} Gaussians, by {target.backend} ({target.score:.2f})"),
+        ("target", f"{taken}; {_place(target, scene)}"),
         ("candidates", f"{result.candidates} hands in {1e3 * seconds:.0f} ms"),
         *(("note", note) for note in (*target.notes, *result.notes)),
         ("margin", margin),

@@ -7,6 +7,7 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from splatbot.collision import GaussianCollisionField
@@ -19,8 +20,9 @@ from splatbot.gaussians import GaussianModel
 from splatbot.logs import Log
 from splatbot.results.folder import RunFolder
 from splatbot.results.metrics import without_nan
-from splatbot.results.views import raw_views
-from splatbot.segmentation import segment
+from splatbot.results.objects import segment_workspace, unseen_through
+from splatbot.results.observers import observers
+from splatbot.results.views import raw_views, subsampled_views
 from splatbot.workspace import find_workspace, fit_workspace
 
 
@@ -126,7 +128,7 @@ def audit_run(run: RunFolder, log: Log, *, n_sigma: float = 2.0) -> RunAudit:
     marks = near.space.pixel[near.missed & (near.space.view == shown)]
     step = frame.camera.width / views[shown][1].width
     return RunAudit(
-        audit, _by_object(near, model, run), frame.rgb, np.rint(marks * step).astype(np.int64), indices[shown]
+        audit, _by_object(near, model, run, log), frame.rgb, np.rint(marks * step).astype(np.int64), indices[shown]
     )
 
 
@@ -140,16 +142,22 @@ def audit_metrics(audit: RunAudit | None) -> dict[str, float | None]:
     }
 
 
-def _by_object(near: SurfaceAudit, model: GaussianModel, run: RunFolder) -> tuple[ObjectAudit, ...]:
-    """Divide the surface by the object of the nearest Gaussian."""
+def _by_object(near: SurfaceAudit, model: GaussianModel, run: RunFolder, log: Log) -> tuple[ObjectAudit, ...]:
+    """Divide the surface by the object of the nearest Gaussian, with the numbers of `splatbot objects`."""
     try:
         workspace = find_workspace(run.map) or fit_workspace(model)
         if workspace.T_world_base is None:
             return ()
-        scene = segment(model, workspace.T_world_base, plane=workspace.support_plane, names=workspace.objects)
+        kept = unseen_through(model, subsampled_views(run, log))
+        solid = model.select(torch.from_numpy(kept))
+        scene = segment_workspace(
+            solid, workspace.T_world_base, workspace, as_known=True, observers=observers(run, solid)
+        )
     except InputError:  # no support plane: the map has no objects
         return ()
-    labels = np.where(near.gaussian >= 0, scene.labels[near.gaussian], -1)
+    of_row = np.full(len(model), -1, np.int32)
+    of_row[kept] = scene.labels
+    labels = np.where(near.gaussian >= 0, of_row[near.gaussian], -1)
     names = {thing.number: thing.name or f"object {thing.number}" for thing in scene.objects}
     found = []
     for label in np.unique(labels):

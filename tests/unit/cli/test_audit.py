@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import json
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
 import torch
 
@@ -13,6 +16,7 @@ from splatbot.cli import main
 from splatbot.formats.ply import save_ply
 from splatbot.gaussians import GaussianModel
 from splatbot.results.folder import RunFolder
+from splatbot.workspace import Workspace
 from tests.unit.cli.conftest import RunCommand, assert_refused
 
 
@@ -55,6 +59,26 @@ def test_a_part_that_is_cut_out_of_the_map_is_found(run: RunCommand, mapped: Pat
     assert summary["holes"][0]["length_m"] > 0.05
     center = torch.tensor(summary["holes"][0]["center_m"])
     assert float((center - model.means.median(0).values).norm()) < 0.15
+
+
+def test_the_audit_numbers_objects_as_the_list_of_objects_does(run: RunCommand, mapped: Path, tmp_path: Path) -> None:
+    """The box of the scene leaves objects out, so that a segmentation of the whole map has other numbers."""
+    folder = tmp_path / "boxed"
+    shutil.copytree(mapped, folder)
+    assert run("info", folder, "--fit-plane").code == 0
+    every = json.loads(run("objects", folder, "--json").out)["objects"]
+    assert len(every) > 1
+    last = every[-1]["center_base_m"]
+    low, high = [x - 0.15 for x in last], [x + 0.15 for x in last]
+    scene = Workspace.load(folder / "scene.yaml")
+    replace(scene, box=np.array([low, high])).save(folder / "scene.yaml")
+    listed = json.loads(run("objects", folder, "--json").out)["objects"]
+    assert 0 < len(listed) < len(every)
+    assert run("audit", folder).code == 0
+    rows = json.loads((folder / "audit.json").read_text())["by_object"]
+    audited = {row["name"] for row in rows if row["name"].startswith("object ")}
+    assert audited
+    assert audited <= {item["target"] for item in listed}
 
 
 def test_a_folder_that_is_no_run_is_refused(run: RunCommand, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import cv2
@@ -30,6 +31,10 @@ def test_ranked_grasps_are_printed_written_and_drawn(run: RunCommand, map_file: 
     assert answer.code == 0, answer.err
     for word in ("conf.", "width", "clear", "red box", "by rules", "errors of the map are not covered"):
         assert word in answer.out
+    taken = re.search(r"(\d+)×(\d+)×(\d+) mm, at \((.*?)\)", " ".join(answer.out.split()))  # which box it took
+    assert taken is not None
+    np.testing.assert_allclose([float(x) for x in taken.groups()[:3]], 1e3 * np.array(BOX.size), atol=8.0)
+    np.testing.assert_allclose([float(x) for x in taken[4].split(",")], BOX.center, atol=0.015)
     assert "closure" not in answer.out
     found = json.loads((out / "grasp.json").read_text())
     assert {"closure", "limits"} < set(found["grasps"][0]["terms"])
