@@ -221,20 +221,6 @@ class ViewerScene:
             opacity=opacity,
         )
 
-    def show_distance(self, points: Sequence[Array]) -> str:
-        """Mark the points (3,) [m] that were clicked, at most two, and return the distance between two as a text."""
-        for name in ("/measure/line", "/measure/label", "/measure/0", "/measure/1"):
-            self._server.scene.remove_by_name(name)
-        for k, point in enumerate(points):
-            self._server.scene.add_icosphere(f"/measure/{k}", CONSTANTS.mark, _AMBER, position=point)
-        if len(points) < 2:
-            return ""
-        line = np.stack(points)[None].astype(np.float32)
-        self._server.scene.add_line_segments("/measure/line", line, _AMBER, thickness=0.002)
-        text = f"{1e3 * np.linalg.norm(points[1] - points[0]):.0f} mm"
-        self._server.scene.add_label("/measure/label", text, position=(points[0] + points[1]) / 2)
-        return text
-
     def show_plan(self, arm: RobotSpheres, plan: JointTrajectory) -> None:
         """Show the tool's path along a planned motion."""
         q = plan.at(np.linspace(0.0, plan.duration, CONSTANTS.path_points)).position
@@ -272,6 +258,21 @@ class ViewerScene:
             wxyz=rotation_to_quat(T[:3, :3]),
             position=T[:3, 3],
         )
+
+
+def show_distance(scene: viser.SceneApi, points: Sequence[Array]) -> str:
+    """Mark the points (3,) [m] that were clicked, at most two, and return the distance between two as a text."""
+    for name in ("/measure/line", "/measure/label", "/measure/0", "/measure/1"):
+        scene.remove_by_name(name)
+    for k, point in enumerate(points):
+        scene.add_icosphere(f"/measure/{k}", CONSTANTS.mark, _AMBER, position=point)
+    if len(points) < 2:
+        return ""
+    line = np.stack(points)[None].astype(np.float32)
+    scene.add_line_segments("/measure/line", line, _AMBER, thickness=0.002)
+    text = f"{1e3 * np.linalg.norm(points[1] - points[0]):.0f} mm"
+    scene.add_label("/measure/label", text, position=(points[0] + points[1]) / 2)
+    return text
 
 
 def clearance_colors(

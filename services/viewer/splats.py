@@ -56,11 +56,38 @@ class Splats:
     rgbs: NDArray[np.float32]
     opacities: NDArray[np.float32]
 
+    def select(self, rows: NDArray[np.integer]) -> Splats:
+        """Return the Gaussians of these rows (M,)."""
+        return Splats(self.centers[rows], self.covariances[rows], self.rgbs[rows], self.opacities[rows])
+
     @property
     def digest(self) -> bytes:
         """Hash of the values: two pieces that look the same have the same digest."""
         parts = (self.centers, self.covariances, self.rgbs, self.opacities)
         return hashlib.blake2b(b"".join(np.ascontiguousarray(p).tobytes() for p in parts), digest_size=16).digest()
+
+
+def splats(
+    model: GaussianModel,
+    coloring: Coloring = "rgb",
+    *,
+    T_world_camera: Array | None = None,
+    scale_of: GaussianModel | None = None,
+) -> Splats:
+    """Return the Gaussians as a browser draws them.
+
+    Args:
+        model: the map, or a part of it.
+        coloring: meaning of the colours. "rgb" shows the map's own; "depth" a camera's depth, red near and blue far.
+            "normal" shows the surface's direction, "uncertainty" the position uncertainty, red for the least known.
+        T_world_camera: (4, 4) of that camera. If None, the world's origin.
+        scale_of: the map whose values give the ends of the colour scale. If None, ``model``.
+    """
+    with torch.no_grad():
+        spread = covariances(model).numpy() + np.eye(3, dtype=np.float32) * np.float32(CONSTANTS.min_variance)
+        opacity = model.opacities.numpy()[:, None]
+    rgb = colors(model, coloring, T_world_camera=T_world_camera, scale_of=scale_of)
+    return Splats(model.means.numpy(), spread, rgb, opacity)
 
 
 def pieces(
@@ -69,10 +96,7 @@ def pieces(
     """Split the Gaussians into cubes of half a metre, or of a doubled edge where there would be too many.
 
     Args:
-        model: the map.
-        coloring: meaning of the colours. "rgb" shows the map's own; "depth" a camera's depth, red near and blue far.
-            "normal" shows the surface's direction, "uncertainty" the position uncertainty, red for the least known.
-        T_world_camera: (4, 4) of that camera. If None, the world's origin.
+        model, coloring, T_world_camera: see :func:`splats`.
     """
     if not len(model):
         return {}
@@ -83,42 +107,43 @@ def pieces(
     keys, piece = np.unique(np.floor(means / edge).astype(np.int64), axis=0, return_inverse=True)
     order = np.argsort(piece.ravel(), kind="stable")
     bounds = np.searchsorted(piece.ravel()[order], np.arange(len(keys) + 1))
-    with torch.no_grad():
-        spread = covariances(model).numpy() + np.eye(3, dtype=np.float32) * np.float32(CONSTANTS.min_variance)
-        opacity = model.opacities.numpy()[:, None]
-    rgb = colors(model, coloring, T_world_camera=T_world_camera)
-    found = {}
-    for i, (x, y, z) in enumerate(keys.tolist()):
-        rows = order[bounds[i] : bounds[i + 1]]
-        found[x, y, z] = Splats(means[rows], spread[rows], rgb[rows], opacity[rows])
-    return found
+    whole = splats(model, coloring, T_world_camera=T_world_camera)
+    return {(x, y, z): whole.select(order[bounds[i] : bounds[i + 1]]) for i, (x, y, z) in enumerate(keys.tolist())}
 
 
-def colors(model: GaussianModel, coloring: Coloring, *, T_world_camera: Array | None = None) -> NDArray[np.float32]:
-    """Return RGB (N, 3) in 0..1; see :func:`pieces`.
+def colors(
+    model: GaussianModel,
+    coloring: Coloring,
+    *,
+    T_world_camera: Array | None = None,
+    scale_of: GaussianModel | None = None,
+) -> NDArray[np.float32]:
+    """Return RGB (N, 3) in 0..1; see :func:`splats`.
 
     Raises:
         InputError: there is no such colouring.
     """
+    scale = model if scale_of is None else scale_of
     with torch.no_grad():
         if coloring == "rgb":
             return model.colors.clamp(0, 1).numpy().astype(np.float32)
         if coloring == "uncertainty":
-            return _turbo(model.uncertainty.numpy())
+            return _turbo(model.uncertainty.numpy(), scale.uncertainty.numpy())
         T_camera_world = np.eye(4) if T_world_camera is None else inverse(T_world_camera)
         if coloring == "normal":
             normals = facing_normals(model, T_camera_world).numpy()
             return (0.5 + 0.5 * normals * np.array([1, -1, -1])).astype(np.float32)
         if coloring == "depth":
-            return _turbo(-transform_points(T_camera_world, model.means.numpy())[:, 2])
+            nearness, ends = (-transform_points(T_camera_world, m.means.numpy())[:, 2] for m in (model, scale))
+            return _turbo(nearness, ends)
     raise InputError(f"is {coloring!r}.", field="coloring", hint=f"use {', '.join(COLORINGS)}")
 
 
-def _turbo(values: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Map values (N,) to RGB (N, 3), blue at their 2nd percentile, red at the 98th."""
+def _turbo(values: NDArray[np.floating], ends: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Map values (N,) to RGB (N, 3), blue at the 2nd percentile of ``ends`` (M,), red at the 98th."""
     if not len(values):
         return np.zeros((0, 3), np.float32)
-    low, high = np.percentile(values, [2, 98])
+    low, high = np.percentile(ends, [2, 98])
     shares = np.clip((values - low) / max(high - low, 1e-9), 0, 1)
     bgr = cv2.applyColorMap(np.rint(255 * shares).astype(np.uint8)[:, None], cv2.COLORMAP_TURBO)
     return (bgr[:, 0, ::-1] / 255).astype(np.float32)

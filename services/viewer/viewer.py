@@ -28,7 +28,7 @@ from splatbot.services.threads import join_started
 from splatbot.services.topics import FRAME, GRASPS, PLAN, RESULT, STATE, TRAJECTORY, JointState
 from splatbot.services.viewer.door import Door
 from splatbot.services.viewer.measuring import surface_point
-from splatbot.services.viewer.scene import ROBOT_DISPLAYS, ViewerScene, close_server, open_server
+from splatbot.services.viewer.scene import ROBOT_DISPLAYS, ViewerScene, close_server, open_server, show_distance
 from splatbot.services.viewer.splats import COLORINGS, Coloring
 from splatbot.slam import FrameResult
 from splatbot.trajectory import Trajectory
@@ -184,7 +184,7 @@ class Viewer:
 
     def _show_clicked(self, points: list[Array]) -> None:
         self._clicked = points
-        self._distance.content = self._scene.show_distance(points)
+        self._distance.content = show_distance(self.server.scene, points)
 
     def _shown(self) -> GaussianModel | None:
         """Return the Gaussians within the crop, or None without a map."""

@@ -5,75 +5,90 @@ from __future__ import annotations
 import sys
 import threading
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from splatbot.cli.paths import check_output
 from splatbot.cli.placing import named_robot
-from splatbot.layouts import map_file
+from splatbot.layouts import is_tiled_map, map_file
+
+if TYPE_CHECKING:
+    from splatbot.services.store import MapStore
+    from splatbot.services.viewer.tile_cover import ViewedTiles
+    from splatbot.trajectory import Trajectory
+    from splatbot.workspace import Workspace
 
 
 def view(
-    map: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="MAP|RUN")],
+    map: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="MAP|RUN|TILES")],
     /,
     *,
     host: str = "127.0.0.1",
     port: int = 8080,
     robot: str = "panda",
     html: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
+    pixel_error: Annotated[float | None, tyro.conf.arg(metavar="PX")] = None,
+    memory_mb: Annotated[float | None, tyro.conf.arg(metavar="MB")] = None,
 ) -> None:
     """Show a map's Gaussians in a web browser, with the camera's trajectory and the robot if they are known.
+
+    Each browser of a tiled map receives the tiles of its view: the coarsest first, and finer ones at rest of the camera.
 
     Examples:
         splatbot view runs/demo
         splatbot view runs/demo --port 9000
         splatbot view runs/demo --html demo.html
+        splatbot view building-tiles --memory-mb 48
 
     Args:
-        map: a map file, or a run folder that holds map.ply.
+        map: a map file, a run folder that holds map.ply, or the folder of a tiled map.
         host: address to listen on; beyond 127.0.0.1 the page needs a key of SPLATBOT_API_KEYS.
         port: port to listen on; 0 takes a free one.
         robot: the arm to show, if a scene.yaml next to the map defines its base.
         html: write one self-contained page, and exit.
+        pixel_error: of a tiled map: largest edge of a cell of merged Gaussians [px], by default 1. 0 is exact.
+        memory_mb: of a tiled map: memory of tiles, and largest size of those of a browser [MB], by default 24.
     """
-    file = map_file(map)
+    is_tiled = is_tiled_map(map)
+    file = map if is_tiled else map_file(map)
+    _check_tiled(is_tiled, html, {"--pixel-error": pixel_error, "--memory-mb": memory_mb})
     check_output(html, "--html", folder=False)
     named_robot(robot)
 
-    from splatbot.atomic import atomic_write
-    from splatbot.gaussians import GaussianModel, Snapshot
     from splatbot.services.access import Access
     from splatbot.services.runtime import check_exposure
     from splatbot.services.settings import load_settings
-    from splatbot.services.store import MapStore
     from splatbot.services.viewer.door import opening_address
-    from splatbot.services.viewer.page import map_page
+    from splatbot.services.viewer.tiled_viewer import TiledViewer
     from splatbot.services.viewer.viewer import Viewer
+    from splatbot.tiles.tiled_map import CONSTANTS
     from splatbot.trajectory import Trajectory
     from splatbot.workspace import find_workspace
 
-    model, workspace = GaussianModel.load(file), find_workspace(map)
-    path = file.with_name("trajectory.tum")
+    path = (file if is_tiled else file.parent) / "trajectory.tum"
     trajectory = Trajectory.load(path) if path.exists() else None
+    workspace = find_workspace(map)
     if html is not None:
-        with atomic_write(html) as handle:
-            handle.write(map_page(model, trajectory=trajectory, workspace=workspace, robot=robot).encode())
-        print(f"{html}: {html.stat().st_size / 1e6:.1f} MB")
+        _write_page(html, file, trajectory, workspace, robot)
         return
-    store = MapStore()
-    store.add(
-        "default",
-        source=file.name,
-        state="static",
-        snapshot=Snapshot(model, 1),
-        trajectory=trajectory,
-        workspace=workspace,
-    )
     settings = load_settings(host=host)
     check_exposure(settings)
     access = Access(settings)
-    viewer = Viewer(store, access, host=host, port=port, robot=robot)
+    viewer: Viewer | TiledViewer
+    if is_tiled:
+        viewer = TiledViewer(
+            _tiles(map, memory_mb),
+            access,
+            host=host,
+            port=port,
+            pixel_error=CONSTANTS.pixel_error if pixel_error is None else pixel_error,
+            robot=robot,
+            workspace=workspace,
+            trajectory=trajectory,
+        )
+    else:
+        viewer = Viewer(_store(file, trajectory, workspace), access, host=host, port=port, robot=robot)
     viewer.start()
     address = opening_address(access, host, viewer.port, to_terminal=sys.stdout.isatty())
     print(f"{address} shows {file}; Ctrl-C ends", flush=True)
@@ -81,3 +96,49 @@ def view(
         threading.Event().wait()
     finally:
         viewer.stop()
+
+
+def _check_tiled(is_tiled: bool, html: Path | None, given: dict[str, float | None]) -> None:
+    """Refuse options of tiled maps for other maps, and one page of a tiled map.
+
+    Raises:
+        InputError: an option does not fit.
+    """
+    from splatbot.errors import InputError
+
+    if is_tiled and html is not None:
+        raise InputError("needs a whole map.", field="--html", hint="give the map that the tiled map was made of")
+    for name, value in given.items():
+        if not is_tiled and value is not None:
+            raise InputError("is for a tiled map.", field=name, hint="write one with `splatbot tile`")
+
+
+def _write_page(html: Path, file: Path, trajectory: Trajectory | None, workspace: Workspace | None, robot: str) -> None:
+    from splatbot.atomic import atomic_write
+    from splatbot.gaussians import GaussianModel
+    from splatbot.services.viewer.page import map_page
+
+    page = map_page(GaussianModel.load(file), trajectory=trajectory, workspace=workspace, robot=robot)
+    with atomic_write(html) as handle:
+        handle.write(page.encode())
+    print(f"{html}: {html.stat().st_size / 1e6:.1f} MB")
+
+
+def _store(file: Path, trajectory: Trajectory | None, workspace: Workspace | None) -> MapStore:
+    """Return the store of one map."""
+    from splatbot.gaussians import GaussianModel, Snapshot
+    from splatbot.services.store import MapStore
+
+    store, snapshot = MapStore(), Snapshot(GaussianModel.load(file), 1)
+    store.add(
+        "default", source=file.name, state="static", snapshot=snapshot, trajectory=trajectory, workspace=workspace
+    )
+    return store
+
+
+def _tiles(folder: Path, memory_mb: float | None) -> ViewedTiles:
+    """Open a tiled map."""
+    from splatbot.services.viewer.tile_cover import ViewedTiles
+    from splatbot.tiles.tiled_map import CONSTANTS
+
+    return ViewedTiles(folder, memory_mb=CONSTANTS.memory_mb if memory_mb is None else memory_mb)
