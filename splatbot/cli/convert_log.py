@@ -33,6 +33,7 @@ def convert_log(
     /,
     *,
     frames: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
+    first_frame: Annotated[int, tyro.conf.arg(metavar="N")] = 0,
     camera: Annotated[str | None, tyro.conf.arg(metavar="PRESET|FILE")] = None,
     depth_scale: Annotated[float | None, tyro.conf.arg(metavar="UNITS")] = None,
     layout: Layout = "tum",
@@ -52,7 +53,8 @@ def convert_log(
     Args:
         log: a log, as for `splatbot map`.
         out: the folder or the .mcap file to write; must not exist.
-        frames: write only the first N frames.
+        frames: write at most N frames.
+        first_frame: number of the first frame to write; frames count from 0.
         camera: intrinsics instead of the log's own, as for `splatbot map`.
         depth_scale: units per metre of depth in a TUM folder; by default those of the log, or 5000 if these are below
             1000.
@@ -79,13 +81,13 @@ def convert_log(
         require_lerobot(out)
 
     from splatbot.logs import open_log
-    from splatbot.logs.base import FirstFrames
+    from splatbot.logs.base import LogPart
 
     whole = open_log(log, camera=camera)
     if whole.cameras:
         hint = "convert the recording of each camera, and name the new ones in a file of your own"
         raise InputError("lists several cameras.", file=log, field="LOG", hint=hint)
-    source = FirstFrames(whole, len(whole) if frames is None else frames)
+    source = LogPart(whole, first_frame, frames)
     with shares(quiet) as show:
         _write(source, out, layout, depth_scale, lambda done: show("writing", done / len(source)))
     if not quiet:

@@ -92,7 +92,7 @@ def _eval_training(folder: Path, *, log: str | None, as_json: bool) -> int:
 
 def _print(title: str, scores: dict[str, Any]) -> None:
     from splatbot.cli.tables import print_table
-    from splatbot.results.units import count, decibels, metres, number, percent
+    from splatbot.results.units import count, decibels, metres, millimetres, number, percent
 
     rows = [
         ("frames tracked", f"{scores['tracked']} of {scores['frames']}"),
@@ -102,8 +102,8 @@ def _print(title: str, scores: dict[str, Any]) -> None:
         ("held-out views", str(scores["held_out"])),
         ("PSNR", decibels(scores["psnr_holdout_db"])),
         ("SSIM", number(scores["ssim_holdout"], 3)),
-        ("depth error, mean", metres(scores["depth_l1_m"])),
-        ("depth error, median", metres(scores["depth_median_m"])),
+        ("depth error, median", millimetres(scores["depth_median_m"])),
+        ("depth error, mean", f"{millimetres(scores['depth_l1_m'])}, with outliers"),
         ("depth covered", percent(scores["depth_coverage"])),
         ("Gaussians", count(scores["gaussians"])),
     ]

@@ -16,6 +16,7 @@ import tyro
 
 _COLUMNS = 120  # widest text of a help
 _BLANK_ROW, _ESCAPES = re.compile(r"│\s+│"), re.compile(r"\x1b\[[0-9;]*m")
+_LARGE = 1e6  # defaults from here on have exponents
 _ON = "(on by default; this option turns it off)"
 
 
@@ -59,6 +60,8 @@ def _hint(default: object) -> str | None:
     """Return the text after an explanation, or None for that of tyro, which prints the default."""
     if default is True:
         return _ON
+    if isinstance(default, float) and abs(default) >= _LARGE:
+        return f"(default: {default:g})".replace("e+0", "e")
     return "" if default is None or default is False or default == () else None
 
 

@@ -42,6 +42,7 @@ def info(
     camera: Annotated[str | None, tyro.conf.arg(metavar="PRESET|FILE")] = None,
     fit_plane: bool = False,
     up: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None,
+    first_frame: Annotated[int, tyro.conf.arg(metavar="N")] = 0,
     support: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
     base_offset: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None,
     picture: Annotated[Path | None, tyro.conf.arg(metavar="PNG")] = None,
@@ -71,11 +72,12 @@ def info(
         up: with --fit-plane, upwards in the first camera (x right, y down, z ahead). It is 0 -1 0 for a camera that
             looked ahead, and 0 0 -1 for one that looked straight down. It replaces an existing estimate. By default
             the log's accelerometer decides, if there is one, else the planes of the map.
+        first_frame: describe a log from this frame on; frames count from 0.
         support: with --fit-plane, propose the base on this support of `splatbot objects`, which lists heights; the
             first one is 0.
         base_offset: with --fit-plane, move the base along its own axes [m] (x ahead, y left, z up), as for a robot on a
             pedestal. Each call moves it further.
-        picture: write colour and depth of the log's first frame, side by side.
+        picture: write colour and depth of the first described frame, side by side.
     """
     from splatbot.cli.fit_plane import fit_plane as fit_plane_command
 
@@ -96,12 +98,14 @@ def info(
         raise InputError("needs a map.", field="--fit-plane", hint="map the log first: splatbot map LOG")
     check_output(picture, "--picture", folder=False)
     from splatbot.logs import open_log
+    from splatbot.logs.base import LogPart
     from splatbot.logs.streams import log_streams
 
     streams = log_streams(path)
     if streams:
         _print_streams(streams, path)
-    log = open_log(path, camera=camera)
+    whole = open_log(path, camera=camera)
+    log = LogPart(whole, first_frame, None) if first_frame else whole
     print_table(describe_log(log), title=None if streams else path)
     if picture is not None:
         _write_picture(log, picture)

@@ -36,6 +36,7 @@ def map_log_command(
     camera: Annotated[str | None, tyro.conf.arg(metavar="PRESET|FILE")] = None,
     on_bad_frame: Literal["stop", "skip"] = "stop",
     max_frames: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
+    first_frame: Annotated[int, tyro.conf.arg(metavar="N")] = 0,
     seconds: Annotated[float | None, tyro.conf.arg(metavar="S")] = None,
     realtime: bool = False,
     rate: Annotated[float | None, tyro.conf.arg(metavar="HZ")] = None,
@@ -81,7 +82,8 @@ def map_log_command(
             tracking.budget_ms=MS; counted in work, so that runs repeat, unless --realtime.
         camera: intrinsics instead of the log's own: tum_fr1, tum_fr2, tum_fr3 or an intrinsics.json.
         on_bad_frame: reaction to a frame that cannot be read: save and stop, or skip it.
-        max_frames: read only the first N frames.
+        max_frames: read at most N frames.
+        first_frame: number of the first frame to read; frames count from 0. A resumed run keeps its own.
         seconds: with a camera, end after this time.
         realtime: feed frames at the times of their stamps, map in parallel with tracking, and drop late frames.
         rate: as realtime, at this rate [Hz].
@@ -102,6 +104,9 @@ def map_log_command(
         raise InputError("a saved run keeps its configuration.", field="--config, --set, --budget-ms", hint=hint)
     if not dump_config:
         device = is_live(log)
+        if first_frame and (device or resume is not None):
+            hint = "leave it out: a camera begins now, and a resumed run where it ended"
+            raise InputError("is for a log.", field="--first-frame", hint=hint)
         if device:
             refuse_with_camera({"--camera": camera, "--robot": robot, "--resume": resume, "--rate": rate})
         elif seconds is not None:
@@ -152,6 +157,7 @@ def map_log_command(
             on_progress=on_progress,
             on_bad_frame=on_bad_frame,
             max_frames=max_frames,
+            first_frame=first_frame,
             realtime=realtime,
             rate=rate,
             save_every=save_every if save_every > 0 else None,

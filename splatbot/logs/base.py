@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any, Protocol, cast
 
 from splatbot.camera import Camera
+from splatbot.errors import InputError
 from splatbot.frame import Frame
 from splatbot.logs.calibration import Calibration
 from splatbot.trajectory import Trajectory
@@ -163,20 +164,36 @@ class DerivedLog(LogBase):
         return len(self._log)
 
 
-class FirstFrames(DerivedLog):
-    """The first frames of a log.
+class LogPart(DerivedLog):
+    """Consecutive frames of a log.
 
     Args:
         log: the whole log.
-        count: largest number of frames.
+        first: index of the first frame.
+        count: largest number of frames; None for all.
+
+    Raises:
+        InputError: the log has no such frame.
     """
 
-    def __init__(self, log: Log, count: int) -> None:
+    def __init__(self, log: Log, first: int, count: int | None) -> None:
         super().__init__(log)
-        self._count = count
+        self._frames = frames_from(log, first, count)
 
     def __len__(self) -> int:
-        return min(self._count, len(self._log))
+        return len(self._frames)
 
     def _decode(self, index: int) -> Frame:
-        return self._log.read(index)
+        return self._log.read(self._frames[index])
+
+
+def frames_from(log: Log, first: int, count: int | None) -> range:
+    """Return the indices of at most ``count`` frames of a log from the frame ``first`` on.
+
+    Raises:
+        InputError: the log has no such frame.
+    """
+    if first and not 0 <= first < len(log):
+        hint = f"the frames of the log have the numbers 0 to {len(log) - 1}"
+        raise InputError(f"is {first}.", file=log.uri, field="--first-frame", hint=hint)
+    return range(len(log))[first : None if count is None else first + count]

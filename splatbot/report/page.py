@@ -18,7 +18,7 @@ from splatbot.results.audit import RunAudit
 from splatbot.results.cameras import camera_rows
 from splatbot.results.folder import FrameRow
 from splatbot.results.scoring import ShownView, TrajectoryScore, ViewScores
-from splatbot.results.units import count, decibels, megabytes, metres, milliseconds, percent
+from splatbot.results.units import count, decibels, megabytes, metres, millimetres, milliseconds, percent
 from splatbot.trajectory import Trajectory
 
 _PACKAGES = ("splatbot", "torch", "numpy", "opencv-contrib-python-headless", "open3d")
@@ -140,8 +140,9 @@ def _views_note(metrics: Mapping[str, Any], views: ViewScores) -> str:
         return note("No held-out view was scored.")
     return note(
         f"Mean over {len(views.scores)} frames that were tracked but never mapped: PSNR "
-        f"{decibels(metrics['psnr_holdout_db'])} over whole images, depth L1 {metres(metrics['depth_l1_m'])} where "
-        f"both have depth. The map covers {percent(metrics['depth_coverage'])} of the sensor's depth pixels."
+        f"{decibels(metrics['psnr_holdout_db'])} over whole images. Where both have depth, its error is "
+        f"{millimetres(metrics['depth_median_m'])} in the median and {millimetres(metrics['depth_l1_m'])} in the mean "
+        f"with all outliers. The map covers {percent(metrics['depth_coverage'])} of the sensor's depth pixels."
     )
 
 

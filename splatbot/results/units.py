@@ -16,6 +16,11 @@ def metres(value: float | None) -> str:
     return f"{1e2 * value:.2f} cm" if abs(value) < 1.0 else f"{value:.2f} m"
 
 
+def millimetres(value: float | None) -> str:
+    """Format a length [m] in mm, for columns of lengths of different sizes."""
+    return NONE if value is None else f"{1e3 * value:,.2f} mm"
+
+
 def degrees(value: float | None) -> str:
     """Format an angle [rad] in degrees."""
     return NONE if value is None else f"{math.degrees(value):.2f}°"

@@ -11,6 +11,7 @@ from splatbot.calibration.timing import SensorTiming, with_estimated_timing, wit
 from splatbot.config import Config, with_cameras, with_sensor
 from splatbot.errors import InputError, LogError
 from splatbot.logs import Log
+from splatbot.logs.base import frames_from
 from splatbot.logs.live import RecordedCamera
 from splatbot.results.folder import RunFolder
 from splatbot.results.metrics import cost_metrics
@@ -20,7 +21,7 @@ from splatbot.run.loop import FrameLoop
 from splatbot.run.outcome import MapPage, RunOutcome
 from splatbot.run.pacing import CameraFrames, LogFrames, PacedSource
 from splatbot.run.progress import Progress
-from splatbot.run.saving import Saver, resume_loop
+from splatbot.run.saving import Saver, first_frame_of, resume_loop
 from splatbot.run.state import Checkpoint, SavedRun
 from splatbot.slam import Slam
 
@@ -51,6 +52,7 @@ def map_log(
     on_progress: Callable[[Progress], None] | None = None,
     on_bad_frame: Literal["stop", "skip"] = "stop",
     max_frames: int | None = None,
+    first_frame: int = 0,
     realtime: bool = False,
     rate: float | None = None,
     save_every: float | None = None,
@@ -76,6 +78,7 @@ def map_log(
         on_progress: called after every frame and at every phase.
         on_bad_frame: whether a frame that cannot be read ends the mapping or is skipped.
         max_frames: read no more frames than this.
+        first_frame: index of the first frame to read. A resumed run keeps its own.
         localise: run whose map the frames are localized in. The map does not change, the trajectory is in its world
             frame, and its configuration applies.
         realtime: deliver frames at the times of their stamps, as a camera does, and map in a second thread. Frames that
@@ -104,7 +107,7 @@ def map_log(
         config = with_sensor(config, log.calibration.sensor, file=log.calibration.file)
         if isinstance(log, RecordedCamera):
             return config, None
-        total = len(log) if max_frames is None else max_frames
+        total = len(log) if max_frames is None else min(len(log), first_frame + max_frames)
         step = Progress("calibrating", 0, total, 0.0)
         return with_estimated_timing(config, log, total, report_progress=lambda _: report_step(step))
 
@@ -130,12 +133,13 @@ def map_log(
         threaded = config.mapping.model_copy(update={"threaded": True})
         wall_clock = config.tracking.model_copy(update={"deterministic": False})
         config = config.model_copy(update={"mapping": threaded, "tracking": wall_clock})
-    frames = _frames(log, max_frames, realtime, rate)
+    begin = first_frame if resume is None else first_frame_of(resume)
+    frames = _frames(log, begin, max_frames, realtime, rate)
     if slam is None:
         config, timing = calibrated(config)
     folder = RunFolder.create(out)
     truth = log.ground_truth  # read now: a damaged file must not cost the user a whole run
-    loop = FrameLoop(frames, slam or Slam(config), config, on_bad_frame, report_step)
+    loop = FrameLoop(frames, slam or Slam(config), config, on_bad_frame, report_step, begin=begin)
     if resume is not None:
         resume_loop(loop, resume)
     with Interrupts() as interrupts:
@@ -187,15 +191,18 @@ def _estimated_timing(run: SavedRun | None) -> SensorTiming | None:
     return SensorTiming.of_metrics(folder.load_metrics().get("sensor_timing"))
 
 
-def _frames(log: Log, max_frames: int | None, realtime: bool, rate: float | None) -> LogFrames:
+def _frames(log: Log, begin: int, max_frames: int | None, realtime: bool, rate: float | None) -> LogFrames:
     """Return the source of the frames.
 
     Raises:
         LogError: the log is empty.
+        InputError: the log has no frame ``begin``.
     """
     if isinstance(log, RecordedCamera):
         return CameraFrames(log)
-    total = len(log) if max_frames is None else min(len(log), max_frames)
-    if total == 0:
+    if len(log) == 0:
         raise LogError("has no frames.", file=log.name, hint="record the log again, or name another one")
-    return PacedSource(log, total, rate) if realtime else LogFrames(log, total)
+    total = frames_from(log, begin, max_frames).stop
+    source = PacedSource(log, total, rate) if realtime else LogFrames(log, total)
+    source.first = begin
+    return source

@@ -53,6 +53,7 @@ class FrameLoop:
         crash: the unexpected exception that ended the loop.
         first_bad: the first unreadable frame.
         started: clock at the start [s].
+        begin: index of the first frame.
         cut: the phase that a signal cut short, "mapping" or "refinement".
         saver: saves the run while it goes on.
     """
@@ -73,6 +74,7 @@ class FrameLoop:
     first_bad: InputError | None = None
     started: float = field(default_factory=time.perf_counter)
     saver: FrameSaver | None = None
+    begin: int = 0
     cut: Literal["mapping", "refinement"] | None = None
 
     def run(self, interrupts: Interrupts) -> None:
@@ -199,8 +201,8 @@ class FrameLoop:
 
     @property
     def done(self) -> int:
-        """Number of frames that were read, skipped or dropped."""
-        return len(self.ms) + len(self.skipped) + len(self.source.dropped)
+        """Index after the last frame that was read, skipped or dropped."""
+        return self.begin + len(self.ms) + len(self.skipped) + len(self.source.dropped)
 
     def rows(self) -> list[FrameRow]:
         """Return one row per frame, in the order of the log."""

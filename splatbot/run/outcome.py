@@ -147,7 +147,7 @@ class RunOutcome:
             "saves": self.loop.saver.cost if self.loop.saver is not None else None,
             "interrupted": self.interrupts.requested is not None,
             "cut": self.loop.cut,
-            "frames_planned": self.loop.source.total or None,
+            "frames_planned": self.loop.source.total - self.loop.begin if self.loop.source.total else None,
             "error": str(error) if error else None,
             "log": {"name": log.name, "frames": len(log), "uri": _absolute(log.uri), **self.source},
             "splatbot": __version__,

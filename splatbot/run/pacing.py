@@ -26,10 +26,10 @@ class Arrival:
 
 
 class LogFrames:
-    """The first ``total`` frames of a log, on demand.
+    """The frames of a log from ``first`` to ``total``, on demand.
 
     Attributes:
-        total: number of frames to deliver; 0 if it is unknown.
+        total: index after the last frame to deliver; 0 if it is unknown.
         first: index of the first frame to deliver; a resumed run has processed the earlier ones.
         dropped: frames that were not delivered before a newer one arrived.
         late: frames that were still being processed when a newer one arrived.

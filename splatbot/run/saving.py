@@ -24,6 +24,7 @@ _NOT_SAVED = {
     "first_bad",
     "started",
     "cut",
+    "begin",
 }
 
 
@@ -118,8 +119,14 @@ def loop_state(loop: FrameLoop) -> dict[str, Any]:
     return {"loop": counters, "source": {"dropped": loop.source.dropped, "late": loop.source.late}}
 
 
+def first_frame_of(saved: SavedRun) -> int:
+    """Return the index of the first frame of a saved run: all later ones were read, skipped or dropped."""
+    loop = saved.loop["loop"]
+    return saved.place.next_index - len(loop["ms"]) - len(loop["skipped"]) - len(saved.loop["source"]["dropped"])
+
+
 def resume_loop(loop: FrameLoop, saved: SavedRun) -> None:
-    """Restore the state of a saved loop into a new one."""
+    """Restore the state of a saved loop into a new one, which begins at the same frame."""
     for name, value in saved.loop["loop"].items():
         setattr(loop, name, value)
     loop.source.first = saved.place.next_index

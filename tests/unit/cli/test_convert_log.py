@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import cv2
@@ -54,6 +55,17 @@ def test_only_the_first_frames_are_written(run: RunCommand, tmp_path: Path, sens
     assert len(open_log(tmp_path / name)) == 2
     assert run("convert-log", sens, tmp_path / f"all-{name}", "--frames", 99).code == 0
     assert len(open_log(tmp_path / f"all-{name}")) == 4
+
+
+def test_a_later_part_is_written_and_described(run: RunCommand, tmp_path: Path, sens: Path) -> None:
+    assert run("convert-log", sens, tmp_path / "part", "--first-frame", 1, "--frames", 2).code == 0
+    part, whole = open_log(tmp_path / "part"), open_log(sens)
+    assert [frame.stamp for frame in part] == [whole[1].stamp, whole[2].stamp]
+    assert re.search(r"frames +3\n", run("info", sens, "--first-frame", 1).out)
+    answer = run("convert-log", sens, tmp_path / "none", "--first-frame", 4)
+    assert answer.code == 2
+    assert "--first-frame: is 4. Fix: the frames of the log have the numbers 0 to 3" in answer.err
+    assert not (tmp_path / "none").exists()
 
 
 def test_the_depth_scale_may_be_chosen(run: RunCommand, tmp_path: Path, frames: list[Frame]) -> None:

@@ -108,6 +108,7 @@ def test_no_help_exceeds_80_columns_or_prints_a_default_of_python(
     monkeypatch.setenv("COLUMNS", "80")
     answer = run(*words, "--help")
     assert answer.code == 0
+    assert "000000.0" not in answer.out  # as 1e9
     lines = answer.out.splitlines()
     assert [line for line in lines if len(line) > 80 and " " in line.strip()] == []
     assert not re.search(r"default: (True|False|None)", " ".join(line.strip("│ ") for line in lines))

@@ -14,7 +14,7 @@ from splatbot.cli.progress import PlainLines, describe
 from splatbot.config import Config
 from splatbot.run import Progress
 from splatbot.slam import FrameResult
-from tests.unit.cli.conftest import RunCommand, assert_fix_named
+from tests.unit.cli.conftest import RunCommand, assert_fix_named, assert_refused
 
 
 def test_a_run_ends_with_a_summary_and_the_report(run: RunCommand, log_folder: Path, tmp_path: Path) -> None:
@@ -118,6 +118,19 @@ def test_ctrl_c_says_what_was_saved_and_exits_with_130(
     assert "interrupted; saved" in answer.out
     assert "4 of 16" in answer.out
     assert (tmp_path / "run" / "map.ply").exists()
+
+
+def test_a_later_part_of_a_log_is_mapped_with_the_numbers_of_its_frames(
+    run: RunCommand, log_folder: Path, tmp_path: Path
+) -> None:
+    words = ("map", log_folder, "--out", tmp_path / "run", "--no-report", "--first-frame", 6)
+    answer = run(*words, "--max-frames", 5)
+    assert answer.code == 0, answer.err
+    assert "5 of 5" in answer.out
+    rows = [json.loads(line) for line in (tmp_path / "run" / "frames.jsonl").read_text().splitlines()]
+    assert [row["index"] for row in rows] == [6, 7, 8, 9, 10]
+    assert_refused(run(*words[:-1], 16, "--overwrite"), "--first-frame: is 16. Fix: the frames of the log have")
+    assert_refused(run("map", "--resume", tmp_path / "run", "--first-frame", 2), "--first-frame: is for a log")
 
 
 @pytest.mark.parametrize(

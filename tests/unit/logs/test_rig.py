@@ -9,7 +9,7 @@ import pytest
 from splatbot.config import Config, with_cameras
 from splatbot.errors import ConfigError, InputError, LogError
 from splatbot.logs import open_log
-from splatbot.logs.base import FirstFrames
+from splatbot.logs.base import LogPart
 from splatbot.logs.rig import MAX_CAMERAS
 from splatbot.run import map_log
 from tests.conftest import MakeLog
@@ -37,7 +37,7 @@ def test_frames_come_in_the_order_of_their_stamps_with_the_name_and_the_size_of_
     assert log.ground_truth is not None
     assert len(log.ground_truth) == 4
     assert [*log.cameras] == ["table"]
-    assert [*FirstFrames(log, 2).cameras] == ["table"]
+    assert [*LogPart(log, 0, 2).cameras] == ["table"]
 
 
 def test_paths_are_relative_to_the_file_and_each_camera_has_its_own_intrinsics(make_log: MakeLog) -> None:

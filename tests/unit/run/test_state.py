@@ -70,6 +70,19 @@ def test_a_resumed_run_is_bit_for_bit_the_uninterrupted_one(whole: Path, copy: P
         assert (copy / name).read_bytes() == (whole / name).read_bytes(), name
 
 
+def test_a_resumed_run_of_a_later_part_is_bit_for_bit_the_uninterrupted_one(tmp_path: Path) -> None:
+    part, log = {"config": small_config(), "first_frame": 5, "report": False}, open_log(LOG)
+    map_log(log, out=tmp_path / "whole", max_frames=6, **part)  # type: ignore[arg-type]
+    map_log(log, out=tmp_path / "run", max_frames=2, save_every=0.0, **part)  # type: ignore[arg-type]
+    saved = SavedRun.load(tmp_path / "run")
+    assert saved.place.next_index == 7
+    resumed = map_log(log, out=tmp_path / "run", resume=saved, max_frames=6, save_every=1e9, report=False)
+    for name in ("trajectory.tum", "map.ply"):
+        assert (tmp_path / "run" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes(), name
+    assert resumed.metrics["frames_planned"] == 6
+    assert SavedRun.load(tmp_path / "run").place.next_index == 11
+
+
 def test_a_run_resumed_three_times_is_still_the_same(whole: Path, tmp_path: Path) -> None:
     map_log(open_log(LOG), out=tmp_path, config=small_config(), max_frames=3, save_every=0.0, report=False)
     for frames in (4, 9, 14):
