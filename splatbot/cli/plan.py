@@ -358,7 +358,9 @@ def _detour(path: JointPath) -> float:
 def _margin_text(covers: dict[str, Any]) -> str:
     if covers["margin_from"] != "audit":
         return {"user": "as given", "none": "0, so that errors of the map are not covered"}[covers["margin_from"]]
+    margin, error = (f"{1e3 * covers[name]:.1f} mm" for name in ("margin_m", "region_error_m"))
+    larger = f"; the margin of {margin} is that of the points near start and goal, or near an earlier path"
     return (
         f"audited: {100 * covers['confidence']:g} % of {covers['region_points']} measured points near the motion are "
-        f"within {1e3 * covers['region_error_m']:.1f} mm of the map; the margin is at least that"
+        f"within {error} of the map{larger if margin != error else ''}"
     )

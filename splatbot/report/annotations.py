@@ -58,6 +58,12 @@ def with_legend(image: NDArray[np.float32], rows: Sequence[tuple[str, Color]]) -
     return _floats(marked)
 
 
+def over_legend(image: NDArray[np.float32], rows: Sequence[tuple[str, Color]]) -> NDArray[np.float32]:
+    """Return an image (H, W, 3) in 0..1 on top of a band with names and their colours, which hides nothing of it."""
+    band = np.zeros((legend_size(rows)[1], image.shape[1], 3), np.float32)
+    return np.concatenate([image, with_legend(band, rows)])
+
+
 def fitting(
     rows: Sequence[tuple[str, Color]], height: int, *, last: Sequence[tuple[str, Color]] = ()
 ) -> list[tuple[str, Color]]:

@@ -21,7 +21,7 @@ from splatbot.planning.closest import ClosestApproach
 from splatbot.planning.timing import clearance_text
 from splatbot.protocols import Array
 from splatbot.rasterize.views import to_png
-from splatbot.report.annotations import Color, with_legend, with_ring, with_scale
+from splatbot.report.annotations import Color, over_legend, with_legend, with_ring, with_scale
 from splatbot.report.moving_page import MAP_IN_COLORS, bytes_of, evenly_spaced, moving_page, packed
 from splatbot.report.robot_drawing import DrawnPart, draw_robot, map_view, sphere_parts
 from splatbot.report.sphere_gaussians import sphere_gaussians
@@ -36,6 +36,7 @@ class PlanPageConstants:
         crop_radius: [m] radius of the map around the base that is shown.
         frames: postures of the animation.
         shown_solids: [m] radius around a collision in which obstacles beyond the map are drawn.
+        visible_depth: [m] depth behind the drawn surfaces at which an obstacle still counts as seen.
         filled: share of the image that the motion fills, seen from a given place.
         around_tool: [m] half edge of the cubes around the path of the tool that are shown then.
         end_opacity: 0..1, of the arm at the start and at the goal.
@@ -46,6 +47,7 @@ class PlanPageConstants:
     crop_radius: float = 1.6
     frames: int = 80
     shown_solids: float = 0.3
+    visible_depth: float = 0.01
     filled: float = 0.92
     around_tool: float = 0.15
     end_opacity: float = 0.4
@@ -205,23 +207,36 @@ def refused_png(
         point: (3,) place of the collision [m, base].
         reason: of the refusal, for the legend.
         solids: obstacles that are not in the map. Those near the place are drawn in violet.
-        width: of the image [px]; the height is 3/4 of it.
+        width: of the image [px]; the height is 3/4 of it, and a legend below.
     """
     camera, T_world_camera, away = _framed(arm, q[None], width)
     at = transform_points(arm.T_world_base, point[None])[0]
     drawn = [model.select(torch.from_numpy(_within(model, inverse(arm.T_world_base))))]
     legend = [("arm at the refused configuration", _END_SHADE), (f"ring: {reason}", _NEAREST)]
-    if solids is not None and len(solids):
-        centers = solids.means.double().numpy()
-        near = np.linalg.norm(centers - at, axis=1) < CONSTANTS.shown_solids
-        drawn.append(_dots(centers[near], 0.003, _SOLID))
-        legend.append(("obstacles that are not in the map: support plane, unknown space", _SOLID))
+    dots = np.zeros((0, 3)) if solids is None else solids.means.double().numpy()
+    dots = dots[np.linalg.norm(dots - at, axis=1) < CONSTANTS.shown_solids]
+    if len(dots):
+        drawn.append(_dots(dots, 0.003, _SOLID))
     view, depth = map_view(GaussianModel.concatenate(drawn), camera, T_world_camera)
+    if _visible(dots, depth, camera, T_world_camera).any():
+        legend.append(("obstacles that are not in the map: support plane, unknown space", _SOLID))
     draw_robot(
         view, depth, camera, T_world_camera, parts, arm.T_world_base @ fk(q[None])[0], tint=_END_SHADE, opacity=0.8
     )
     view = _ringed(view, camera, T_world_camera, at)
-    return to_png(with_scale(with_legend(view, legend), camera, away, "at the middle of the picture"), "rgb")
+    return to_png(over_legend(with_scale(view, camera, away, "at the middle of the picture"), legend), "rgb")
+
+
+def _visible(points: Array, depth: NDArray[np.float32], camera: Camera, T_world_camera: Array) -> NDArray[np.bool_]:
+    """Return which points (P, 3) [m, world] are in an image and not behind the surfaces of its depth (H, W) [m]."""
+    x, y, z = transform_points(inverse(T_world_camera), points).T
+    ahead = np.maximum(z, 1e-6)
+    u, v = np.rint(camera.fx * x / ahead + camera.cx), np.rint(camera.fy * y / ahead + camera.cy)
+    inside = (z > 0.0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    found = np.zeros(len(points), np.bool_)
+    behind = depth[v[inside].astype(np.int64), u[inside].astype(np.int64)]
+    found[inside] = (behind <= 0.0) | (z[inside] < behind + CONSTANTS.visible_depth)
+    return found
 
 
 def _framed(arm: RobotSpheres, q: Array, width: int) -> tuple[Camera, Array, float]:

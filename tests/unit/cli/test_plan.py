@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from splatbot.bench.tabletop import tabletop
+from splatbot.cli.plan import _margin_text
 from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.robots.panda import panda
 from splatbot.workspace import Workspace
@@ -212,3 +213,10 @@ def test_what_cannot_be_planned_is_said(
     words: tuple[object, ...], message: str, run: RunCommand, map_file: Path
 ) -> None:
     assert_refused(run("plan", "--map", map_file, *BASE, *words), message)
+
+
+def test_two_numbers_of_a_margin_have_a_reason_and_equal_ones_are_printed_once() -> None:
+    covers = {"margin_from": "audit", "confidence": 0.999, "region_points": 61491, "region_error_m": 0.0033}
+    text = _margin_text(covers | {"margin_m": 0.0036})
+    assert "within 3.3 mm of the map; the margin of 3.6 mm is that of the points near start and goal" in text
+    assert _margin_text(covers | {"margin_m": 0.0033}).endswith("within 3.3 mm of the map")

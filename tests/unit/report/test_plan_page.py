@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -14,7 +15,8 @@ from splatbot.geometry import inverse, look_at, transform_points
 from splatbot.planning import Certificate, JointTrajectory
 from splatbot.planning.closest import ClosestApproach
 from splatbot.report import plan_page
-from splatbot.report.annotations import legend_size
+from splatbot.report.annotations import legend_size, over_legend
+from splatbot.report.sphere_gaussians import sphere_gaussians
 from splatbot.robots.appearance import coarse_appearance
 from splatbot.robots.store import load_robot
 from tests.unit.grasping.objects import model
@@ -42,6 +44,34 @@ def test_the_legend_of_a_plan_names_all_that_is_drawn_and_fits_the_picture(monke
     assert names[4] == "shell: certified spheres of the nearest link, and 20.0 mm of margin"
     assert len({color for _, color in rows}) == 5
     assert legend_size(rows)[0] < 960
+
+
+@pytest.mark.parametrize(("height", "seen"), [(0.2, True), (-0.03, False)], ids=["in the open", "in the table"])
+def test_the_legend_of_a_refusal_hides_nothing_and_names_obstacles_only_where_they_are_seen(
+    monkeypatch: pytest.MonkeyPatch, height: float, seen: bool
+) -> None:
+    """The table is opaque, and the camera looks from above."""
+    robot = load_robot("ur5e-2f85")
+    legend: list[tuple[str, Any]] = []
+    views: list[np.ndarray] = []
+
+    def kept(image: Any, rows: Sequence[tuple[str, Any]]) -> Any:
+        legend.extend(rows)
+        views.append(image)
+        return over_legend(image, rows)
+
+    monkeypatch.setattr(plan_page, "over_legend", kept)
+    solids = sphere_gaussians(np.array([[0.5, 0.0, height]]), np.array([0.005]), np.array([0.5, 0.5, 0.5]), 0.99)
+    picture = plan_page.refused_png(
+        model(), RobotSpheres(robot), np.asarray(robot.home), coarse_appearance(robot), robot.fk,
+        point=np.array([0.5, 0.0, 0.1]), reason="x", solids=solids, width=320,
+    )  # fmt: skip
+    assert any(name.startswith("obstacles") for name, _ in legend) == seen
+    drawn = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR)
+    assert drawn is not None
+    drawn = drawn[..., ::-1].astype(np.float64)
+    assert drawn.shape == (240 + legend_size(legend)[1], 320, 3)
+    assert np.abs(drawn[:240] - 255.0 * np.clip(views[0], 0.0, 1.0)).max() <= 1.0
 
 
 @pytest.mark.parametrize("place", [(1.5, -0.4, 1.0), (-0.6, 0.9, 1.4), (0.2, 0.0, 3.0)])
