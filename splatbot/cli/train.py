@@ -222,12 +222,13 @@ def _train(
             return 0
         if in_place:
             RunFolder(data.folder).replace_map(session.trainer.model)
+        changes: list[tuple[str, str]] = []
         with interrupts.interruptible(after=int(interrupts.requested is not None)):
             scores = session.score(training_pictures, report)
             if in_place:
-                _rescore(RunFolder(data.folder), log)
+                changes = _rescore(RunFolder(data.folder), log)
     if not quiet:
-        _print(folder, data.folder / MAP_NAME if in_place else folder.map, scores)
+        _print(folder, data.folder / MAP_NAME if in_place else folder.map, scores, changes)
     return 0 if scores["complete"] else _interrupted(folder, interrupts.requested)
 
 
@@ -322,12 +323,13 @@ def _train_blocks(
         model = training.merge()
         if in_place:
             RunFolder(data.folder).replace_map(model)
+        changes: list[tuple[str, str]] = []
         with interrupts.interruptible():
             scores = training.score(model, training_pictures, report)
             if in_place:
-                _rescore(RunFolder(data.folder), log)
+                changes = _rescore(RunFolder(data.folder), log)
     if not quiet:
-        _print(folder, data.folder / MAP_NAME if in_place else folder.map, scores)
+        _print(folder, data.folder / MAP_NAME if in_place else folder.map, scores, changes)
     return 0
 
 
@@ -352,12 +354,26 @@ def _interrupted(folder: TrainingFolder, number: int | None) -> int:
     return 128 + (number or signal.SIGINT)
 
 
-def _rescore(run: RunFolder, log: str | None) -> None:
-    """Write the figures of the trained map into ``metrics.json`` of its run; ``log`` is where the recording is now."""
+def _rescore(run: RunFolder, log: str | None) -> list[tuple[str, str]]:
+    """Write the figures of the trained map into ``metrics.json`` of its run; return those of before and after.
+
+    ``log`` is where the recording is now.
+    """
     from splatbot.results.rescore import rescore
+    from splatbot.results.units import decibels, millimetres
     from splatbot.robots.in_view import reopen_log
 
-    run.save_metrics(run.load_metrics() | rescore(run, reopen_log(run, uri=log)))
+    before = run.load_metrics()
+    after = before | rescore(run, reopen_log(run, uri=log))
+    run.save_metrics(after)
+    psnr, depth = (
+        [shown(values[key]) for values in (before, after)]
+        for shown, key in ((decibels, "psnr_holdout_db"), (millimetres, "depth_median_m"))
+    )
+    return [
+        ("held-out frames of the run", f"{psnr[0]} before, {psnr[1]} after"),
+        ("median depth error on them", f"{depth[0]} before, {depth[1]} after"),
+    ]
 
 
 @contextmanager
@@ -403,7 +419,7 @@ def _numbers(progress: TrainingProgress, *, wide: bool = True) -> str:
     return "  ".join(filter(None, parts))
 
 
-def _print(folder: TrainingFolder, map_: Path, scores: dict[str, Any]) -> None:
+def _print(folder: TrainingFolder, map_: Path, scores: dict[str, Any], changes: list[tuple[str, str]]) -> None:
     from splatbot.cli.tables import print_table
     from splatbot.results.units import count, decibels, number
 
@@ -416,6 +432,7 @@ def _print(folder: TrainingFolder, map_: Path, scores: dict[str, Any]) -> None:
         ("PSNR", decibels(scores["psnr_db"])),
         ("colour-corrected PSNR", decibels(scores["corrected_psnr_db"])),
         ("SSIM", number(scores["ssim"], 3)),
+        *changes,
         *_camera_rows(folder),
         ("map", str(map_)),
         *(("picture", str(path)) for path in pictures if path.exists()),

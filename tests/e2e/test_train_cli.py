@@ -140,9 +140,13 @@ def test_the_map_of_a_run_is_improved_in_place_and_the_earlier_one_kept(tmp_path
     subprocess.run([sys.executable, "-m", "splatbot", "map", *words], check=True, timeout=200)
     mapped = (run / "map.ply").read_bytes()
     folder = RunFolder(run)
-    before = GaussianModel.load(run / "map.ply")
+    before, metrics = GaussianModel.load(run / "map.ply"), folder.load_metrics()
     code, printed, err = finish(start(str(run), "--iterations", "150"))
     assert code == 0, err
+    scores = folder.load_metrics()
+    psnr, depth = ([each[key] for each in (metrics, scores)] for key in ("psnr_holdout_db", "depth_median_m"))
+    assert f"{psnr[0]:.1f} dB before, {psnr[1]:.1f} dB after" in printed
+    assert f"{1e3 * depth[0]:.2f} mm before, {1e3 * depth[1]:.2f} mm after" in printed
     assert str(run / "map.ply") in printed
     assert (run / "map.mapped.ply").read_bytes() == mapped
     after = GaussianModel.load(run / "map.ply")
