@@ -355,7 +355,7 @@ def _interrupted(folder: TrainingFolder, number: int | None) -> int:
 
 
 def _rescore(run: RunFolder, log: str | None) -> list[tuple[str, str]]:
-    """Write the figures of the trained map into ``metrics.json`` of its run; return those of before and after.
+    """Write the figures of the trained map into ``metrics.json`` of its run; return the previous and the new ones.
 
     ``log`` is where the recording is now.
     """
