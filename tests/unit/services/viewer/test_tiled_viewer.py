@@ -16,11 +16,14 @@ from numpy.typing import NDArray
 
 from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.errors import FormatError, InputError
+from splatbot.gaussians import GaussianModel
 from splatbot.geometry import look_at, rotation_to_quat
 from splatbot.robots.store import load_robot
 from splatbot.services.access import Access
 from splatbot.services.settings import ServiceSettings
+from splatbot.services.viewer import tile_browser
 from splatbot.services.viewer.scene import clearance_colors
+from splatbot.services.viewer.tile_browser import TileBrowserConstants
 from splatbot.services.viewer.tile_cover import ViewedTiles
 from splatbot.services.viewer.tiled_viewer import TiledViewer
 from splatbot.tiles import write_tiles
@@ -50,8 +53,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def open_viewer(folder: Path) -> Iterator[Open]:
-    """Opens viewers of the map with some memory in Gaussians."""
+def open_viewer(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Open]:
+    """Opens viewers of the map with some memory in Gaussians, which follow a camera sooner than usual."""
+    monkeypatch.setattr(tile_browser, "CONSTANTS", TileBrowserConstants(rest=0.1, period=0.1))
     opened: list[TiledViewer] = []
 
     def call(gaussians: int = N, place: Path = folder, **more: object) -> TiledViewer:
@@ -129,7 +133,7 @@ def test_tiles_in_both_views_stay_and_a_camera_at_rest_receives_nothing(open_vie
         before = set(client.splats)
         count = len(client.sent)
         client.look(*pose(INSIDE, EAST))
-        client.drain(1.2)
+        client.drain(0.5)
         assert len(client.sent) == count
         client.look(*pose(INSIDE, NORTH_EAST))
         client.read(lambda: len(client.sent) > count)
@@ -145,7 +149,7 @@ def test_a_browser_never_has_more_gaussians_than_the_memory(open_viewer: Open) -
     with ViserClient(open_viewer(limit, pixel_error=0.0).port) as client:
         for target in (EAST, NORTH, WEST, NORTH_EAST):
             client.look(*pose(INSIDE, target))
-            client.drain(0.6)
+            client.drain(0.4)
         client.look(*pose(ABOVE, FLOOR))
         client.read(lambda: "allows no less" in client.text)
         assert 0.5 * limit < client.most <= limit
@@ -164,17 +168,18 @@ def test_two_browsers_have_the_tiles_of_their_own_cameras(open_viewer: Open) -> 
         assert len(rows(east.centers) - rows(west.centers)) > 500
 
 
-def test_only_the_camera_at_which_a_stream_of_cameras_rests_is_served(open_viewer: Open) -> None:
+def test_of_a_stream_of_cameras_the_last_is_served_and_few_before_it(open_viewer: Open) -> None:
     with ViserClient(open_viewer(pixel_error=0.0).port) as client:
         client.look(*pose(INSIDE, EAST))
         client.read(lambda: settled(client))
-        count, names = len(client.sent), set(client.splats)
+        count = len(client.sent)
         for _ in range(200):
             client.look(*pose(INSIDE, NORTH))
             client.look(*pose(INSIDE, WEST))
         client.read(lambda: has_view(client, WEST))
-        client.drain(0.8)
-        assert set(client.sent[count:]) == set(client.splats) - names
+        client.drain(0.4)
+        assert len(client.sent) - count < 5 * len(client.splats)  # of 400 cameras
+        assert in_camera(INSIDE, WEST, client.centers)[:, 2].min() > -4.0
 
 
 def test_a_browser_that_leaves_is_released_and_no_more_than_8_are_served(open_viewer: Open) -> None:
@@ -234,15 +239,15 @@ def test_the_crop_the_colours_and_the_measure_work_on_the_tiles_that_are_loaded(
         client.set("measure", True)
         opaque = MEANS[(MODEL.opacities.numpy() > 0.8) & (MEANS[:, 2] > 0.95 * MEANS[:, 2].max())]  # the ceiling
         ends = opaque[opaque[:, 0].argmin()], opaque[opaque[:, 0].argmax()]
-        for end in ends:
-            client.click(end - 9.0 * DOWN, DOWN)
-            client.drain(0.6)
+        client.click(ends[0] - 9.0 * DOWN, DOWN)
+        client.read(lambda: "/measure/0" in client.nodes)
+        client.click(ends[1] - 9.0 * DOWN, DOWN)
         client.read(lambda: " mm" in client.text)
         (distance,) = re.findall(r"^(\d+) mm$", client.text, re.MULTILINE)
         assert float(distance) == pytest.approx(1e3 * np.linalg.norm(ends[0] - ends[1]), abs=20.0)
         client.set("crop, m", 2.0)
         client.read(lambda: 0 < len(client.centers) < N)
-        client.drain(0.6)
+        client.drain(0.3)
         middle = np.median(MEANS, axis=0)
         assert np.linalg.norm(client.centers - middle, axis=1).max() < 2.0 + 0.5
 
@@ -287,6 +292,35 @@ def test_a_damaged_tile_is_named_and_a_damaged_overview_is_refused(tmp_path: Pat
     (place / "tiles.bin").write_bytes(data)
     with pytest.raises(FormatError, match="damaged"):
         open_viewer(place=place)
+
+
+def test_an_empty_map_is_shown_as_one(tmp_path: Path, open_viewer: Open) -> None:
+    write_tiles(GaussianModel.empty(), tmp_path / "tiles")
+    with ViserClient(open_viewer(place=tmp_path / "tiles").port) as client:
+        client.look(*pose(INSIDE, EAST))
+        client.read(lambda: settled(client))
+        assert "0 of 0 Gaussians** are loaded, in 0 tiles" in client.text
+        client.set("measure", True)
+        client.click(INSIDE, DOWN)
+        client.set("crop, m", 1.0)
+        client.drain(0.4)
+        assert "cannot be shown" not in client.text
+        assert not client.sent
+
+
+@pytest.mark.parametrize(
+    ("label", "value"), [("crop, m", "wide"), ("crop, m", np.nan), ("colours", "pink"), ("colours", 3)]
+)
+def test_a_control_of_no_meaning_does_not_end_the_view(open_viewer: Open, label: str, value: object) -> None:
+    viewer = open_viewer()
+    with ViserClient(viewer.port) as client:
+        client.look(*pose(INSIDE, EAST))
+        client.read(lambda: settled(client))
+        client.set(label, value)
+        client.drain(0.4)
+    with ViserClient(viewer.port) as client:
+        client.look(*pose(INSIDE, EAST))
+        client.read(lambda: settled(client))
 
 
 @pytest.mark.parametrize("error", [-1.0, np.inf, np.nan])
