@@ -33,7 +33,7 @@ def view(
 ) -> None:
     """Show a map's Gaussians in a web browser, with the camera's trajectory and the robot if they are known.
 
-    Each browser of a tiled map receives the tiles of its view: the coarsest first, then finer ones when it rests.
+    Each browser of a tiled map receives the tiles of its view: the coarsest first, finer ones when its camera rests.
 
     Examples:
         splatbot view runs/demo
