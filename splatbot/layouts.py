@@ -301,7 +301,7 @@ def log_layout(path: Path) -> bool:
 
 def _map_hint(folder: Path) -> str:
     if is_tiled_map(folder):
-        return "it is a tiled map, for `splatbot render`, `info` and `serve`; give the map that it was made of"
+        return "it is a tiled map, for `splatbot render`, `view`, `info` and `serve`; give the map that it was made of"
     if log_layout(folder):
         return f"it is a recording; map it first: splatbot map {folder}"
     if (folder / "state").is_dir():

@@ -337,19 +337,23 @@ def _print(result: GraspResult, scene: SegmentedMap, folder: Path, margin: str, 
     terms = list(result.grasps[0].terms) if verbose else []
     contacts = ["contacts"] if result.grasps[0].implied else []
     table = Table()
-    for name in ("grasp", "total", "conf.", "from", "width", "opens", "clear", *contacts, *terms):
+    lifts = ["lift"] if any(g.lift_blocked for g in result.grasps) else []
+    for name in ("grasp", "total", "conf.", "from", "width", "opens", "clear", *lifts, *contacts, *terms):
         table.add_column(name, justify="left" if name == "from" else "right")
     for k, g in enumerate(result.grasps):
         lengths = (f"{1e3 * value:.1f}" for value in (g.width, g.opening, g.clearance))
         contact = [" and ".join("implied" if each else "measured" for each in g.implied)] if contacts else []
+        lift = ["no" if g.lift_blocked else "yes"] if lifts else []
         values = (f"{g.terms[name]:.2f}" for name in terms)
-        table.add_row(str(k), f"{g.total:.3f}", f"{g.confidence:.2f}", g.approach, *lengths, *contact, *values)
+        table.add_row(str(k), f"{g.total:.3f}", f"{g.confidence:.2f}", g.approach, *lengths, *lift, *contact, *values)
     print_columns(table)
     print_text("grasp: its rank from 0, as plan and plan-pick take it (--grasp-index)")
     print_text("from: above (top, within 40 degrees), level away from the robot (front), level (side), else (free)")
     print_text("width of the closed hand, opening on the approach, and clearance from the surroundings, in mm")
     print_text("the best total is 1; --verbose prints its terms, of which the best value is 1")
     print_text("conf.: share of such grasps that succeeded in simulation; errors of the map are not in it")
+    if lifts:
+        print_text("lift: whether 15 cm straight up with the object are certified, as plan-pick requires")
     if contacts:
         print_text("a measured contact is within 3 mm of depth that three frames agree on; an implied one is not")
         if any(g.implied and any(g.implied) for g in result.grasps):

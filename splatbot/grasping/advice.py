@@ -57,11 +57,6 @@ _CHANGES = (
         "map the place from more sides, or let unknown space be free",
     ),
     (
-        "cannot lift the target",
-        "it cannot be lifted",
-        "move that neighbour away; if it belongs to the target, mark both (--mask)",
-    ),
-    (
         "touch the target before they approach",
         TOUCHES,
         "try the other direction: --approach top or --approach side",

@@ -73,7 +73,6 @@ _IN_TARGET = "hands are in the target on their way"
 _IN_MAP = "hands touch the surroundings of the target"
 _UNEVEN = "hands have something that stands out under a pad"
 _IN_DEPTH = "hands are in measured depth"
-_UNLIFTED = "cannot lift the target"
 _DEEP = "are in measured depth"  # the kind of a rejection by the dense check
 
 
@@ -334,7 +333,7 @@ class Search:
         if avoid_moving is not None:
             clear = [k for k, grasp in enumerate(left) if grasp.avoids_moving]
             checked = self._checked([left[k] for k in clear], avoid_moving, self.o.wanted)
-            found = [grasp for grasp, _ in checked if not grasp.rejected]
+            found = _best_lifted(checked, self.o.wanted)
             known = {k for k, (grasp, _) in zip(clear, checked, strict=False) if not grasp.rejected}
             left = [_exposed(grasp) for k, grasp in enumerate(left) if k not in known]
         checked = self._checked(left, reach, self.o.wanted - len(found))
@@ -344,13 +343,13 @@ class Search:
         if blocked:  # the best of the most frequent kind, which the advice names
             usual = Counter(kind for _, kind in blocked).most_common(1)[0][0]
             self.log.best = next(grasp for grasp, kind in blocked if kind == usual)
-        found += [grasp for grasp, _ in checked if not grasp.rejected]
-        return tuple(sorted(found, key=lambda g: (not g.avoids_moving, -g.total)))
+        found += _best_lifted(checked, self.o.wanted - len(found))
+        return tuple(sorted(found, key=lambda g: (not g.avoids_moving, bool(g.lift_blocked), -g.total)))
 
     def _checked(
         self, grasps: Sequence[Grasp], reach: ReachabilityCheck | None, wanted: int
     ) -> list[tuple[Grasp, str]]:
-        """Check grasps in order until ``wanted`` are reachable; return each with the kind of its rejection."""
+        """Check grasps in order until ``wanted`` can be reached and lifted; return each with its kind of rejection."""
         checked: list[tuple[Grasp, str]] = []
         for grasp in grasps:
             if wanted == 0:
@@ -360,7 +359,7 @@ class Search:
                 back = self._judged(_backed_off(grasp), reach)
                 judged, kind = back if not back[0].rejected else (judged, kind)
             checked.append((judged, kind))
-            wanted -= not checked[-1][0].rejected
+            wanted -= not (judged.rejected or judged.lift_blocked)
         return checked
 
     def _judged(self, grasp: Grasp, reach: ReachabilityCheck | None) -> tuple[Grasp, str]:
@@ -370,8 +369,7 @@ class Search:
             judged, kind = self._at_full_density(judged, self.s.raw)
         if judged.rejected or judged.q is None or self.lift is None:
             return judged, kind
-        reason = self.lift(judged.q, judged.width)
-        return (replace(judged, rejected=reason), _UNLIFTED) if reason else (judged, kind)
+        return replace(judged, lift_blocked=self.lift(judged.q, judged.width)), kind
 
     def _lift(self) -> Callable[[Array, float], str]:
         """Return a check of the lift at joint positions (J,) and a width [m], as plans of picks make it; "" is free."""
@@ -490,6 +488,12 @@ class Search:
                     f"The best grasp is {100 * away:.0f} cm from the indicated point. If it is on another object, both "
                     "are connected in the map; a mask separates them."
                 )
+        unlifted = [grasp for grasp in grasps if grasp.lift_blocked]
+        if unlifted:
+            notes.append(
+                f"{len(unlifted)} of {len(grasps)} grasps have no certified lift, so that plan-pick refuses them: "
+                f"{unlifted[0].lift_blocked}. If that neighbour belongs to the target, mark both (--mask)."
+            )
         if grasps and (part := part_note(grasps[0], self.surface.points)):
             notes.append(part)
         completed = float(1.0 - self.surface.observed.mean())
@@ -502,6 +506,12 @@ class Search:
                 f"{1e3 * opens:.0f} mm, less {1e3 * gap:.0f} mm at each pad."
             )
         return tuple(notes)
+
+
+def _best_lifted(checked: Sequence[tuple[Grasp, str]], wanted: int) -> list[Grasp]:
+    """Return up to ``wanted`` grasps that are not rejected, in order, those with a certified lift first."""
+    accepted = [grasp for grasp, _ in checked if not grasp.rejected]
+    return sorted(accepted, key=lambda grasp: bool(grasp.lift_blocked))[: max(wanted, 0)]
 
 
 def _with_terms(grasp: Grasp, terms: Mapping[str, float]) -> Grasp:

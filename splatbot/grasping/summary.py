@@ -56,6 +56,7 @@ def _grasp_summary(grasp: Grasp) -> dict[str, Any]:
         "q_pregrasp": grasp.q_pregrasp.tolist() if grasp.q_pregrasp is not None else None,
         "approach_path": grasp.approach_path.tolist() if grasp.approach_path is not None else None,
         "rejected": grasp.rejected,
+        "lift_blocked": grasp.lift_blocked,
     }
 
 
@@ -99,6 +100,7 @@ def grasp_from(values: Mapping[str, Any]) -> Grasp:
         rejected=str(values["rejected"]),
         depth_distance=array("contact_depth_distance_m", 2),
         unseen=array("finger_unseen", 2),
+        lift_blocked=str(values.get("lift_blocked", "")),
     )
 
 

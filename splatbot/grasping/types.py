@@ -42,6 +42,7 @@ class Grasp:
             such points near the target. If None, it was not checked.
         unseen: (2,) share of the inner face of each contact's finger that no frame saw to be free, 0..1. If None, it
             was not checked.
+        lift_blocked: reason for which the straight lift of a pick is not certified; empty if it is, or was not checked.
     """
 
     T_world_tcp: Array
@@ -60,6 +61,7 @@ class Grasp:
     rejected: str = ""
     depth_distance: Array | None = None
     unseen: Array | None = None
+    lift_blocked: str = ""
 
     @property
     def confidence(self) -> float:

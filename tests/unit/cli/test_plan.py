@@ -134,7 +134,7 @@ def test_a_certified_trajectory_is_written_with_its_pictures(run: RunCommand, ma
     assert not RobotSpheres(panda()).check(field, q).in_collision.any()
     picture = cv2.imread(str(out / "plan.png"))
     assert picture is not None
-    assert picture.shape == (720, 960, 3)
+    assert picture.shape == (960, 1280, 3)
     assert picture.std() > 5
     page = (out / "plan.html").read_text()
     assert "http://" not in page
