@@ -34,7 +34,7 @@ def tile(
     """Write a map as a folder of tiles, of which a program loads only those that it needs.
 
     Collision queries in a box have the answers of the whole map. Views use coarser tiles where details are below a
-    pixel. `splatbot render`, `info` and `serve` take the folder. The scene.yaml next to the map is copied to it.
+    pixel. `splatbot render`, `view`, `info` and `serve` take the folder, and a copy of the map's scene.yaml is in it.
 
     The sweep compares the tiled map with the whole one. References are the held-out images of the run, or the whole map
     with 16 rays a pixel from 6 virtual views.
