@@ -20,6 +20,8 @@ Array = NDArray[np.float64]
 
 NAME = "scene.yaml"
 MAX_JOINT_DELAY_S = 1.0
+MAX_BASE_OFFSET = 100.0
+"""Largest move of a base along an axis [m]; larger numbers are probably millimetres."""
 MAX_PREFIX = 128
 """Longest prefix of names in TF [characters]."""
 _KEYS = (
@@ -185,12 +187,16 @@ class Workspace:
         """Return the workspace with the base moved by ``offset`` (3,) [m] along its own axes; the box stays in place.
 
         Raises:
-            InputError: the base is unknown, or the offset is not three finite numbers.
+            InputError: the base is unknown, or the offset is not three numbers within 100 m.
         """
         moved = np.asarray(offset, dtype=np.float64)
         _check("base offset", moved, (3,), "three numbers")
+        if np.abs(moved).max() > MAX_BASE_OFFSET:
+            hint = f"give metres, at most {MAX_BASE_OFFSET:g} along each axis"
+            raise InputError(f"is {moved.tolist()}.", field="base offset", hint=hint)
         if self.T_world_base is None:
-            raise InputError("is not known.", field="T_world_base", hint="propose one: splatbot info RUN --fit-plane")
+            hint = "propose one: splatbot info RUN --fit-plane --up X Y Z"
+            raise InputError("is not known.", field="T_world_base", hint=hint)
         T = self.T_world_base.copy()
         T[:3, 3] += T[:3, :3] @ moved
         box = None if self.box is None else self.box - moved

@@ -10,6 +10,7 @@ from splatbot.cli.tables import print_table, print_text
 
 if TYPE_CHECKING:
     from splatbot.gaussians import GaussianModel
+    from splatbot.protocols import Array
     from splatbot.up_direction import WorkspaceEstimate
     from splatbot.workspace import Workspace
 
@@ -46,7 +47,10 @@ def fit_plane(map_file: Path, up: Up | None, support: int | None, base_offset: U
         if notes:
             notes.append(("note", f"the plane is used, because {found.decided_by} gives the direction"))
     if support is not None:
-        place, how = _with_support(place, _on_support(model, place, support)), f"support {support} of the map"
+        if known is not None and known.T_world_base is not None and not known.base_proposed:
+            notes.append(("note", f"the base before was at {_text(known.T_world_base[:3, 3])}, and was not a proposal"))
+        proposed = _on_support(model, map_file.parent, place, support)
+        place, how = _with_support(place, proposed), f"support {support} of the map"
     if base_offset is not None:
         place, how = place.with_base_moved(base_offset), f"{how}, with the base moved"
     if place is not known:
@@ -69,7 +73,7 @@ def _with_support(known: Workspace, found: Workspace) -> Workspace:
     )
 
 
-def _on_support(model: GaussianModel, place: Workspace, number: int) -> Workspace:
+def _on_support(model: GaussianModel, folder: Path, place: Workspace, number: int) -> Workspace:
     """Propose a base on a support of the map, by its number in `splatbot objects`.
 
     Raises:
@@ -79,13 +83,14 @@ def _on_support(model: GaussianModel, place: Workspace, number: int) -> Workspac
 
     from splatbot.errors import InputError
     from splatbot.gaussians import Snapshot
-    from splatbot.segmentation import segment
+    from splatbot.robots.graspable_objects import measured_map, run_of, segment_objects
     from splatbot.workspace import workspace_on
 
     T = place.T_world_base
     if T is None:
-        raise InputError("needs a base.", field="--support", hint="leave it out once, to propose a base on the plane")
-    supports = segment(Snapshot(model, map_version=0), T, box=place.box, plane=place.support_plane).supports
+        raise InputError("needs a base.", field="--support", hint="propose one first: --fit-plane --up X Y Z")
+    measured = measured_map(Snapshot(model, map_version=0), run_of(folder))
+    supports = segment_objects(measured, T, place, as_known=True).scene.supports
     if not 0 <= number < len(supports):
         heights = ", ".join(f"{k} at {1e3 * each.offset:+.0f} mm" for k, each in enumerate(supports))
         hint = f"heights above the base: {heights}" if supports else "give --up X Y Z"
@@ -141,19 +146,18 @@ def _candidate(place: Workspace) -> str:
 
 
 def _rows(found: Workspace) -> list[tuple[str, str]]:
-    import numpy as np
-
-    def text(values: np.ndarray | None) -> str:
-        return "not known" if values is None else " ".join(f"{x:.3f}" for x in np.ravel(values))
-
     T = found.T_world_base
     return [
-        ("gravity", text(found.gravity)),
-        ("support plane n, d [m]", text(found.support_plane)),
-        ("base at [m]", text(None if T is None else T[:3, 3])),
-        ("base's x, z", text(None if T is None else T[:3, [0, 2]].T)),
-        ("workspace, from the base [m]", text(found.box)),
+        ("gravity", _text(found.gravity)),
+        ("support plane n, d [m]", _text(found.support_plane)),
+        ("base at [m]", _text(None if T is None else T[:3, 3])),
+        ("base's x, z", _text(None if T is None else T[:3, [0, 2]].T)),
+        ("workspace, from the base [m]", _text(found.box)),
     ]
+
+
+def _text(values: Array | None) -> str:
+    return "not known" if values is None else " ".join(f"{x:.3f}" for x in values.ravel())
 
 
 def _draw(model: GaussianModel, place: Workspace, map_file: Path) -> None:

@@ -84,6 +84,8 @@ def info(
     for flag, given in (("--up", up), ("--support", support), ("--base-offset", base_offset)):
         if given is not None and not fit_plane:
             raise InputError("goes with --fit-plane.", field=flag, hint="give both")
+    if first_frame and (is_tiled_map(path) or is_map(path)):
+        raise InputError("needs a log.", field="--first-frame", hint="leave it out for a map")
     if is_tiled_map(path):
         return _describe_tiled(path, fit_plane=fit_plane, picture=picture)
     if is_map(path):

@@ -129,7 +129,8 @@ def train(
         log_kind(log)
     check_output(out)
     port = _viewer_port(viewer)
-    set_interruption("interrupted; nothing was trained yet")
+    if resume is None:
+        set_interruption("interrupted; nothing was trained yet")
 
     from splatbot.cli.datasets import open_training_data
     from splatbot.training.distributed import planned_group
@@ -312,6 +313,7 @@ def _train_blocks(
     with Interrupts() as interrupts:
         with interrupts.interruptible():
             training = BlockTraining(data, folder, settings, start=_start(data, folder, settings), resume=resumed)
+            set_interruption()
         if not training.run(
             at_once,
             checkpoint_s=checkpoint_every,
@@ -367,7 +369,7 @@ def _rescore(run: RunFolder, log: str | None) -> list[tuple[str, str]]:
     after = before | rescore(run, reopen_log(run, uri=log))
     run.save_metrics(after)
     psnr, depth = (
-        [shown(values[key]) for values in (before, after)]
+        [shown(values.get(key)) for values in (before, after)]
         for shown, key in ((decibels, "psnr_holdout_db"), (millimetres, "depth_median_m"))
     )
     return [

@@ -31,16 +31,21 @@ PART = PartConstants()
 def part_note(grasp: Grasp, points: Array) -> str:
     """Return a note if the hand closes on a part of the target: much of its surface is outside of the pads.
 
-    A point with the coordinate t along the closing direction, from the middle of the contacts, is beyond the pads if
-    ``|t| > width / 2 + 1 cm``.
+    With the coordinate t along the mean normal of the contacts, from their middle, a point is beyond the pads if
+    ``|t| > d / 2 + 1 cm``. The contacts are d apart along that normal. The closing direction may be tilted
+    against the normals, by the friction cone, and would count the height of a tall object.
 
     Args:
         grasp: the grasp.
         points: (P, 3) on the surface of the target [m, world].
     """
-    along = grasp.contacts[1] - grasp.contacts[0]
-    t = (points - grasp.contacts.mean(axis=0)) @ (along / np.linalg.norm(along))
-    outside = np.abs(t) - grasp.width / 2
+    normal = grasp.normals[1] - grasp.normals[0]
+    length = float(np.linalg.norm(normal))
+    if length < 1e-6:
+        return ""
+    normal = normal / length
+    apart = abs(float((grasp.contacts[1] - grasp.contacts[0]) @ normal))
+    outside = np.abs((points - grasp.contacts.mean(axis=0)) @ normal) - apart / 2
     share = float((outside > PART.beyond).mean())
     if share < PART.share:
         return ""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,7 +11,7 @@ from splatbot.calibration.timing import SensorTiming, with_estimated_timing, wit
 from splatbot.config import Config, with_cameras, with_sensor
 from splatbot.errors import InputError, LogError
 from splatbot.logs import Log
-from splatbot.logs.base import frames_from
+from splatbot.logs.base import LogPart, frames_from
 from splatbot.logs.live import RecordedCamera
 from splatbot.results.folder import RunFolder
 from splatbot.results.metrics import cost_metrics
@@ -100,16 +100,20 @@ def map_log(
     if resume is not None:
         resume.place.check(log)
         config, slam = resume.config, resume.slam
-    report_step = on_progress or (lambda _: None)
+    tell = on_progress or (lambda _: None)
+
+    def report_step(step: Progress) -> None:
+        tell(replace(step, done=max(step.done - first_frame, 0), total=max(step.total - first_frame, 0)))
+
     timing = _estimated_timing(resume)
 
     def calibrated(config: Config) -> tuple[Config, SensorTiming | None]:
         config = with_sensor(config, log.calibration.sensor, file=log.calibration.file)
         if isinstance(log, RecordedCamera):
             return config, None
-        total = len(log) if max_frames is None else min(len(log), first_frame + max_frames)
-        step = Progress("calibrating", 0, total, 0.0)
-        return with_estimated_timing(config, log, total, report_progress=lambda _: report_step(step))
+        part = LogPart(log, first_frame, max_frames)
+        step = Progress("calibrating", 0, len(part), 0.0)
+        return with_estimated_timing(config, part, len(part), report_progress=lambda _: tell(step))
 
     if localise is not None:
         slam = localise.slam

@@ -8,7 +8,7 @@ import numpy as np
 
 from splatbot.gaussians import GaussianModel
 from splatbot.workspace import NamedPlace, Workspace
-from tests.unit.cli.conftest import RunCommand
+from tests.unit.cli.conftest import RunCommand, assert_refused
 from tests.unit.test_workspace import _table
 
 
@@ -90,6 +90,11 @@ def test_the_base_moves_along_its_own_axes_and_is_a_proposal_no_more(run: RunCom
     np.testing.assert_allclose(after.box, before.box - expected[:3, 3], atol=2e-6)
     np.testing.assert_array_equal(after.support_plane, before.support_plane)
     assert not after.base_proposed
+    answer = run("info", tmp_path, "--fit-plane", "--base-offset", 600, 0, 0)
+    assert_refused(answer, "base offset: is [600.0, 0.0, 0.0]. Fix: give metres, at most 100")
+    answer = run("info", tmp_path, "--fit-plane", "--support", 0)
+    assert answer.code == 0, answer.err
+    assert "and was not a proposal" in answer.out
 
 
 def test_a_support_of_the_list_carries_the_base(run: RunCommand, tmp_path: Path) -> None:

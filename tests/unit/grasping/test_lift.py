@@ -13,6 +13,7 @@ from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.gaussians import GaussianModel
 from splatbot.grasping.advice import first_change
 from splatbot.grasping.affordance import Target
+from splatbot.grasping.doubts import part_note
 from splatbot.grasping.lift import target_spheres
 from splatbot.grasping.options import GraspOptions
 from splatbot.grasping.reach import BLOCKED, BLOCKED_FAR, BLOCKED_NEAR, ArmReach
@@ -130,3 +131,19 @@ def test_the_size_of_the_whole_cluster_is_no_reason_against_a_marked_part_of_it(
     result = GraspResult(part, (), {FITTING + BLOCKED_FAR: 2}, None, 2, {}, map_version=0)
     assert first_change(result, scene(), 0.08)[0] == BLOCKED
     assert "apart" in first_change(replace(result, target=replace(part, rows=whole)), scene(), 0.08)[0]
+
+
+@pytest.mark.parametrize("degrees", [0.0, 10.0, 20.0])
+def test_a_closing_direction_that_is_tilted_on_a_tall_object_alone_is_not_noted(degrees: float) -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-0.5, 0.5, (4000, 3)) * (0.06, 0.06, 0.20)
+    rise = 0.03 * np.tan(np.radians(degrees))
+    some = GraspSampler(scene(), panda(), hand_only=True).sample(
+        target_of(scene(), BOX, "box"), GraspOptions(samples=50)
+    )
+    contacts = np.array([[-0.03, 0.0, -rise], [0.03, 0.0, rise]])
+    normals = np.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    tilted = replace(some.grasps[0], contacts=contacts, normals=normals)
+    assert part_note(tilted, points) == ""
+    assert "100%" in part_note(tilted, points + np.array([0.2, 0.0, 0.0]))
+    assert part_note(replace(tilted, normals=normals * 0.0), points) == ""

@@ -381,3 +381,11 @@ def test_a_journal_that_is_mostly_waste_is_begun_anew(tmp_path: Path) -> None:
         assert np.array_equal(read_entry(journal.path, entry), kept)
     assert journal.number > 0
     assert journal.path.stat().st_size < 4 * 50 * 8
+
+
+def test_the_progress_of_a_later_part_counts_its_own_frames(tmp_path: Path) -> None:
+    steps: list[tuple[int, int]] = []
+    log, note = open_log(LOG), lambda step: steps.append((step.done, step.total))
+    map_log(log, out=tmp_path, config=small_config(), first_frame=5, max_frames=3, report=False, on_progress=note)
+    assert {total for _, total in steps} == {3}
+    assert [done for done, _ in steps][:3] == [1, 2, 3]
