@@ -196,12 +196,15 @@ class LivePage(AbstractContextManager["LivePage"]):
             open_timeout=CONSTANTS.opening_s,
             close_timeout=CONSTANTS.ending_s,
             logger=_log,
-        ):
+        ) as server:
             self._opened.set()
             await self._ended.wait()
             until = time.monotonic() + CONSTANTS.ending_s
             while any(client.waits for client in self.clients) and time.monotonic() < until:
                 await asyncio.sleep(0.02)
+            for connection in server.connections:
+                if connection.transport.get_write_buffer_size():  # its client does not read, and closing would wait
+                    connection.transport.abort()
 
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
         """Return a refusal, the page, or None for a WebSocket."""

@@ -135,7 +135,7 @@ def wilson(successes: int, trials: int) -> Interval:
     p, z2 = successes / trials, _Z**2
     middle = (p + z2 / (2 * trials)) / (1 + z2 / trials)
     half = _Z * float(np.sqrt(p * (1 - p) / trials + z2 / (4 * trials**2))) / (1 + z2 / trials)
-    return Interval(p, max(0.0, middle - half), min(1.0, middle + half))
+    return Interval(p, min(p, max(0.0, middle - half)), max(p, min(1.0, middle + half)))  # rounded at 0 and 1
 
 
 def agreement(

@@ -137,11 +137,11 @@ class Benchmark:
             raise
         settings.save(results)
         results.write_csv(settings.folder / f"{settings.stem}.csv")
-        self.plot(results, settings.folder)
         if settings.json is not None:
             results.write_json(settings.json)
         if settings.csv is not None:
             results.write_csv(settings.csv)
+        self.plot(results, settings.folder)
         return results
 
 

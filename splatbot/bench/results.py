@@ -91,7 +91,10 @@ class Results:
         """
         try:
             values = json.loads(path.read_text())
-            return cls(values["machine"], [Row(**row) for row in values["rows"]], values.get("curves", {}))
+            results = cls(values["machine"], [Row(**row) for row in values["rows"]], values.get("curves", {}))
+            if not isinstance(results.machine, dict) or not isinstance(results.curves, dict):
+                raise ValueError("machine or curves are no objects")
+            return results
         except FileNotFoundError:
             hint = "run the benchmark first, or give the folder of its results"
             raise InputError("does not exist.", file=path, field="--out", hint=hint) from None

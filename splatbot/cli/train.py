@@ -143,7 +143,6 @@ def train(
         settings = folder.load_settings()
         if dataset is not None:  # it was moved
             settings = replace(settings, dataset=dataset.resolve())
-            folder.save_settings(settings)
         data = open_training_data(settings.dataset, settings.scale, log)
     else:
         assert dataset is not None
@@ -213,7 +212,9 @@ def _train(
                 session = TrainingSession(
                     data, folder, settings, start=start, checkpoint_s=checkpoint_every, resume=resumed, group=group
                 )
-                if not resumed and group.leads:
+                if group.leads and resumed:
+                    folder.save_settings(settings)  # the images are those of the start, perhaps at another place
+                elif group.leads:
                     folder.begin(settings)
                     begun = True
                 set_interruption()
@@ -314,6 +315,8 @@ def _train_blocks(
         with interrupts.interruptible():
             training = BlockTraining(data, folder, settings, start=_start(data, folder, settings), resume=resumed)
             set_interruption()
+        if resumed:
+            folder.save_settings(settings)
         if not training.run(
             at_once,
             checkpoint_s=checkpoint_every,

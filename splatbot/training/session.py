@@ -132,7 +132,7 @@ class TrainingSession:
 
     def _check_views(self, views: list[str], data: TrainingData) -> None:
         if views != self._views():
-            hint = "restore the images, or train again (--overwrite)"
+            hint = "restore the images, or give their place: splatbot train --resume RUN DATASET"
             raise InputError("has other images than at the start.", file=data.folder, field="--resume", hint=hint)
 
     def _state(self) -> dict[str, Any]:

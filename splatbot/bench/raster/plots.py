@@ -31,6 +31,8 @@ def plot_growth(results: Results, out: Path) -> None:
         for metric in ("forward+backward", "stages over Gaussians", "stages over pixels"):
             points = [Point(int(r.case.rpartition(" ")[2]), r.value) for r in rows if r.metric == metric and r.value]
             curves.append(PlotCurve(metric, points))
+        if not curves[0].points:  # of a benchmark that was interrupted
+            continue
         first, last = curves[0].points[0], curves[0].points[-1]
         slope = last.y / last.x
         curves.append(PlotCurve("linear", [Point(first.x, slope * first.x), Point(last.x, last.y)], "reference"))

@@ -60,3 +60,15 @@ def test_eval_scores_held_out_views_with_the_refined_intrinsics(
     (out / "cameras.json").write_text(json.dumps(values))
     assert main(["eval", str(out), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["psnr_db"] != scores["psnr_db"]
+
+
+def test_a_resume_with_other_images_is_refused_and_the_training_keeps_its_own(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    train(write_wide_scene(tmp_path / "scene", points=200, rows=3), out, capsys)
+    before = (out / "training.json").read_bytes()
+    other = write_wide_scene(tmp_path / "other", points=200, rows=2)
+    assert main(["train", str(other), "--resume", str(out)]) == 2
+    assert "give their place" in capsys.readouterr().err
+    assert (out / "training.json").read_bytes() == before

@@ -112,3 +112,11 @@ def test_rows_that_do_not_fit_are_refused() -> None:
         agreement(["a"], np.ones((2, 3)), np.ones((2, 3)))
     with pytest.raises(InputError, match="finite"):
         pearson([0.1, np.nan], [0.1, 0.2])
+
+
+def test_the_interval_holds_its_rate_at_0_and_1_for_every_number_of_trials() -> None:
+    for trials in range(1, 201):
+        for rate, found in ((0.0, wilson(0, trials)), (1.0, wilson(trials, trials))):
+            assert found.low is not None
+            assert found.high is not None
+            assert found.low <= rate <= found.high

@@ -6,6 +6,7 @@ import json
 import re
 import socket
 import threading
+import time
 from collections.abc import Iterator
 
 import pytest
@@ -184,3 +185,21 @@ def test_the_end_sends_what_waits_and_closes_all() -> None:
         browser.recv(timeout=10)
     with pytest.raises(OSError, match="refused"):
         socket.create_connection(("127.0.0.1", page.port))
+
+
+def test_a_browser_that_does_not_read_does_not_hold_up_the_end() -> None:
+    upgrade = "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Key: "
+    with socket.socket() as line:
+        with LivePage(0) as page:
+            page.show({"name": "x" * 3_000_000, "trained": 2, "views": [], "up": [0, 0, 1]}, 3)
+            line.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
+            line.connect(("127.0.0.1", page.port))
+            line.sendall(
+                f"GET /live HTTP/1.1\r\nHost: 127.0.0.1:{page.port}\r\nCookie: {cookie_of(page)}\r\n"
+                f"{upgrade}AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n".encode()
+            )
+            until(lambda: bool(page.clients))
+            for _ in range(3):
+                page.announce("status", "y" * 1_000_000)
+            began = time.monotonic()
+        assert time.monotonic() - began < 8.0  # the keepalive of WebSockets alone takes up to 40 s
