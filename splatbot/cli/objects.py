@@ -138,9 +138,7 @@ def _print(found: tuple[ListedObject, ...], planes: list[dict[str, Any]]) -> Non
             at = " ".join(f"{x:.2f}" for x in item.at_base)
             table.add_row(str(item.number), item.label, size, at, *_verdicts(item))
         print_columns(table)
-    print_text(
-        "no.: rank by the number of Gaussians, for this base and box of scene.yaml; others renumber them"
-    )
+    print_text("no.: rank by the number of Gaussians, for this base and box of scene.yaml; others renumber them")
     print_text("at: the middle of the object from the base; size: long side, short side, height")
     for verdict in dict.fromkeys(word for item in found for word in _verdicts(item) if word in _MEANINGS):
         print_text(f"{verdict}: {_MEANINGS[verdict]}")

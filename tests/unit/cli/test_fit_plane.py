@@ -83,11 +83,17 @@ def test_the_base_moves_along_its_own_axes_and_is_a_proposal_no_more(run: RunCom
     assert answer.code == 0, answer.err
     assert "the file, with the base moved, replaced" in answer.out
     after = Workspace.load(tmp_path / "scene.yaml")
+    assert before.T_world_base is not None
+    assert after.T_world_base is not None
     moved = np.linalg.inv(before.T_world_base) @ after.T_world_base
     expected = np.eye(4)
     expected[:3, 3] = [-0.2, 0.4, 0.6]
     np.testing.assert_allclose(moved, expected, atol=2e-6)
+    assert before.box is not None
+    assert after.box is not None
     np.testing.assert_allclose(after.box, before.box - expected[:3, 3], atol=2e-6)
+    assert after.support_plane is not None
+    assert before.support_plane is not None
     np.testing.assert_array_equal(after.support_plane, before.support_plane)
     assert not after.base_proposed
     answer = run("info", tmp_path, "--fit-plane", "--base-offset", 600, 0, 0)
@@ -104,6 +110,7 @@ def test_a_support_of_the_list_carries_the_base(run: RunCommand, tmp_path: Path)
     answer = run("info", tmp_path, "--fit-plane", "--support", 1)
     assert answer.code == 0, answer.err
     found = Workspace.load(tmp_path / "scene.yaml")
+    assert found.T_world_base is not None
     assert abs(found.T_world_base[1, 3] - T) < 0.01  # y is down in the world of the camera
     answer = run("info", tmp_path, "--fit-plane", "--support", 7)
     assert answer.code == 2
