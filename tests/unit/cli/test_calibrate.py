@@ -158,7 +158,8 @@ def test_two_pose_files_of_one_motion_give_the_hand_eye_pose_and_the_time_offset
         (("{images}", "--board", BOARD, "--robot", "panda", "--link", "9"), "--link"),
         (("{images}", "--board", BOARD, "--robot", "nobody"), "nobody"),
         (("{images}", "--board", BOARD, "--offsets", "yes"), "--offsets"),
-        (("{images}", "--board", BOARD, "--poses", "x.txt"), "--joints, --poses"),
+        (("{images}", "--board", BOARD, "--poses", "{poses}"), "--joints, --poses"),
+        (("{images}", "--board", BOARD, "--poses", "x.txt"), "x.txt: --poses: does not exist"),
         (("{images}", "--board", BOARD, "--max-views", "0"), "--max-views"),
         (("{images}", "--board", BOARD, "--link", "0"), "--link"),
         (("{images}", "--board", BOARD, "--same-clock"), "--same-clock"),
@@ -174,7 +175,9 @@ def test_wrong_input_of_hand_eye_is_named_and_no_scene_is_written(
     run: RunCommand, tmp_path: Path, data_root: Path, words: tuple[str, ...], message: str
 ) -> None:
     (tmp_path / "empty").mkdir()
-    places = {"{images}": str(data_root / "panda_charuco_32"), "{empty}": str(tmp_path / "empty")}
+    (tmp_path / "poses.txt").write_text("0 0 0 0 0 0 0 1\n")
+    images, poses = data_root / "panda_charuco_32", tmp_path / "poses.txt"
+    places = {"{images}": str(images), "{empty}": str(tmp_path / "empty"), "{poses}": str(poses)}
     given = [places.get(word, word) for word in words]
     answer = run("calibrate", "hand-eye", *given, "--out", tmp_path / "scene.yaml")
     assert answer.code == 2
