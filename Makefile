@@ -43,7 +43,7 @@ serve: $(INSTALL_STAMP) ## HTTP service on a map (MAP=file.ply HOST=127.0.0.1 PO
 test: export OMP_NUM_THREADS := 1
 # Compiled files are kept: each process would compile the tests and their asserts again.
 test test-long: export PYTHONDONTWRITEBYTECODE :=
-test: $(INSTALL_STAMP) ## the test suite without its long part (12 minutes on 2 cores)
+test: $(INSTALL_STAMP) ## the test suite without its long part (13 minutes on 2 cores)
 	$(BIN)/python -m pytest -m "not long" --numprocesses auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder $(PYTEST_ARGS)
 
 .PHONY: test-long
