@@ -55,7 +55,8 @@ def shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Run
         training = RunningTraining(tmp_path / "training", page)
         try:
             browser.open(f"http://127.0.0.1:{page.port}/?key={read_key(key_file())}")
-            until(lambda: browser.evaluate("typeof drawn != 'undefined' && drawn != null && !at('photo').hidden"))
+            ready = "typeof at == 'function' && typeof drawn != 'undefined' && drawn != null && !at('photo').hidden"
+            until(lambda: browser.evaluate(ready))
             yield training, browser
         finally:
             training.end()
