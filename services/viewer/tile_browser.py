@@ -20,8 +20,8 @@ from splatbot.protocols import Array
 from splatbot.services.viewer.measuring import surface_point
 from splatbot.services.viewer.scene import show_distance
 from splatbot.services.viewer.splats import COLORINGS, Coloring, Splats, splats
-from splatbot.services.viewer.tile_cover import TileCover, ViewedTiles
 from splatbot.services.viewer.viewer import CONSTANTS as VIEWER
+from splatbot.tiles import TileCover, TiledMap
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ class TileBrowser:
     def __init__(
         self,
         client: viser.ClientHandle,
-        tiles: ViewedTiles,
+        tiles: TiledMap,
         wake: Callable[[], None],
         *,
         pixel_error: float,
@@ -150,7 +150,7 @@ class TileBrowser:
             if self._changed_s + CONSTANTS.rest <= self._served_s:
                 self._changed_s = np.inf
                 camera, pose = self._camera.pinhole(CONSTANTS.margin)
-                self._show(self._tiles.cover(camera, pose, self._pixel_error))
+                self._show(self._tiles.cover(camera, pose, pixel_error=self._pixel_error))
         except SplatbotError as error:
             self._state.content = f"**cannot be shown:** {error}"
 
@@ -231,7 +231,7 @@ class TileBrowser:
             return f"{loaded} This is the coarsest level; finer tiles follow when the camera rests."
         reached = f"The pixel error is {cover.pixel_error:,.2f} px, and {self._pixel_error:g} px are requested."
         if cover.pixel_error > self._pixel_error:
-            reached += f" The limit of {self._tiles.most:,} Gaussians a browser allows no less."
+            reached += f" The limit of {self._tiles.most_in_view:,} Gaussians a browser allows no less."
         return f"{loaded} {reached}"
 
     def _take_click(self, origin: Array, direction: Array) -> None:

@@ -23,9 +23,8 @@ from splatbot.services.viewer.door import Door
 from splatbot.services.viewer.scene import CONSTANTS as SCENE
 from splatbot.services.viewer.scene import ROBOT_DISPLAYS, ViewerScene, close_server, open_server
 from splatbot.services.viewer.tile_browser import TileBrowser
-from splatbot.services.viewer.tile_cover import ViewedTiles
 from splatbot.tiles.tiled_map import CONSTANTS as TILES
-from splatbot.tiles.tiled_map import TileMemoryError
+from splatbot.tiles.tiled_map import TiledMap, TileMemoryError
 from splatbot.trajectory import Trajectory
 from splatbot.workspace import Workspace
 
@@ -68,7 +67,7 @@ class TiledViewer:
 
     def __init__(
         self,
-        tiles: ViewedTiles,
+        tiles: TiledMap,
         access: Access,
         *,
         host: str = "127.0.0.1",

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from splatbot.cli.paths import check_file, check_output
+from splatbot.cli.tiled import check_tiled
 from splatbot.layouts import is_tiled_map, map_file
 
 if TYPE_CHECKING:
@@ -69,7 +70,8 @@ def render(
     is_tiled = is_tiled_map(map_)
     file = map_ if is_tiled else map_file(map_)
     path = trajectory or (None if is_tiled else _own_trajectory(map_, index, video))
-    _check_tiled(is_tiled, video, {"--pixel-error": pixel_error, "--memory-mb": memory_mb})
+    tiled = {"--pixel-error": pixel_error, "--memory-mb": memory_mb}
+    check_tiled(is_tiled, whole={"--video": video}, tiled=tiled)
     check_file(trajectory, "--trajectory")
     check_output(out, folder=False)
     check_output(video, folder=False)
@@ -96,21 +98,6 @@ def render(
         image.write(to_png(view, mode))
     print(target)
     return 0
-
-
-def _check_tiled(is_tiled: bool, video: Path | None, given: dict[str, float | None]) -> None:
-    """Refuse options of tiled maps for other maps, and a video of a tiled map.
-
-    Raises:
-        InputError: an option does not fit.
-    """
-    from splatbot.errors import InputError
-
-    if is_tiled and video is not None:
-        raise InputError("needs a whole map.", field="--video", hint="give the map that the tiled map was made of")
-    for name, value in given.items():
-        if not is_tiled and value is not None:
-            raise InputError("is for a tiled map.", field=name, hint="write one with `splatbot tile`")
 
 
 def _load_view(

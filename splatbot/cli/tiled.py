@@ -2,9 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
+from splatbot.errors import InputError
 from splatbot.layouts import TILES_NAME
+
+
+def check_tiled(is_tiled: bool, *, whole: Mapping[str, object], tiled: Mapping[str, object]) -> None:
+    """Refuse options of another kind of map; an option that was not given is None.
+
+    Args:
+        is_tiled: whether the map is tiled.
+        whole: options that need a whole map.
+        tiled: options of tiled maps.
+
+    Raises:
+        InputError: an option does not fit.
+    """
+    if is_tiled:
+        needed, hint, unfit = "needs a whole map.", "give the map that the tiled map was made of", whole
+    else:
+        needed, hint, unfit = "is for a tiled map.", "write one with `splatbot tile`", tiled
+    for name, value in unfit.items():
+        if value is not None:
+            raise InputError(needed, field=name, hint=hint)
 
 
 def describe_tiles(folder: Path) -> list[tuple[str, str]]:

@@ -11,11 +11,12 @@ import tyro
 
 from splatbot.cli.paths import check_output
 from splatbot.cli.placing import named_robot
+from splatbot.cli.tiled import check_tiled
 from splatbot.layouts import is_tiled_map, map_file
 
 if TYPE_CHECKING:
     from splatbot.services.store import MapStore
-    from splatbot.services.viewer.tile_cover import ViewedTiles
+    from splatbot.tiles import TiledMap
     from splatbot.trajectory import Trajectory
     from splatbot.workspace import Workspace
 
@@ -52,7 +53,8 @@ def view(
     """
     is_tiled = is_tiled_map(map)
     file = map if is_tiled else map_file(map)
-    _check_tiled(is_tiled, html, {"--pixel-error": pixel_error, "--memory-mb": memory_mb})
+    tiled = {"--pixel-error": pixel_error, "--memory-mb": memory_mb}
+    check_tiled(is_tiled, whole={"--html": html}, tiled=tiled)
     check_output(html, "--html", folder=False)
     named_robot(robot)
 
@@ -98,21 +100,6 @@ def view(
         viewer.stop()
 
 
-def _check_tiled(is_tiled: bool, html: Path | None, given: dict[str, float | None]) -> None:
-    """Refuse options of tiled maps for other maps, and one page of a tiled map.
-
-    Raises:
-        InputError: an option does not fit.
-    """
-    from splatbot.errors import InputError
-
-    if is_tiled and html is not None:
-        raise InputError("needs a whole map.", field="--html", hint="give the map that the tiled map was made of")
-    for name, value in given.items():
-        if not is_tiled and value is not None:
-            raise InputError("is for a tiled map.", field=name, hint="write one with `splatbot tile`")
-
-
 def _write_page(html: Path, file: Path, trajectory: Trajectory | None, workspace: Workspace | None, robot: str) -> None:
     from splatbot.atomic import atomic_write
     from splatbot.gaussians import GaussianModel
@@ -136,9 +123,8 @@ def _store(file: Path, trajectory: Trajectory | None, workspace: Workspace | Non
     return store
 
 
-def _tiles(folder: Path, memory_mb: float | None) -> ViewedTiles:
+def _tiles(folder: Path, memory_mb: float | None) -> TiledMap:
     """Open a tiled map."""
-    from splatbot.services.viewer.tile_cover import ViewedTiles
-    from splatbot.tiles.tiled_map import CONSTANTS
+    from splatbot.tiles.tiled_map import CONSTANTS, TiledMap
 
-    return ViewedTiles(folder, memory_mb=CONSTANTS.memory_mb if memory_mb is None else memory_mb)
+    return TiledMap(folder, memory_mb=CONSTANTS.memory_mb if memory_mb is None else memory_mb)

@@ -2,7 +2,7 @@
 
 from splatbot.tiles.field import TiledField
 from splatbot.tiles.part import MapPart
-from splatbot.tiles.tiled_map import TiledMap, TiledView
+from splatbot.tiles.tiled_map import TileCover, TiledMap, TiledView
 from splatbot.tiles.writing import write_tiles
 
-__all__ = ["MapPart", "TiledField", "TiledMap", "TiledView", "write_tiles"]
+__all__ = ["MapPart", "TileCover", "TiledField", "TiledMap", "TiledView", "write_tiles"]

@@ -66,6 +66,20 @@ CONSTANTS = TiledMapConstants()
 _RESTORE = "restore it from a copy, or write the tiled map again"
 
 
+@dataclass(frozen=True)
+class TileCover:
+    """Tiles that cover a view.
+
+    Args:
+        numbers: of the tiles in the index; none of them is an ancestor of another.
+        pixel_error: largest edge of a cell of merged Gaussians in the view [px]; larger than requested if the memory
+            does not suffice.
+    """
+
+    numbers: tuple[int, ...]
+    pixel_error: float
+
+
 @dataclass(frozen=True, eq=False)
 class TiledView:
     """Gaussians for a view.
@@ -153,10 +167,26 @@ class TiledMap:
         """Corners (3,) of the box of all means [m, world]; of a map with Gaussians."""
         return self._low[self._leaves].min(axis=0), self._high[self._leaves].max(axis=0)
 
+    @property
+    def most_in_view(self) -> int:
+        """Largest number of Gaussians of a view: those of the memory."""
+        return self._most
+
+    def coarsest(self) -> TileCover:
+        """Return the cover of every view: the root of the tree, or no tile of an empty map."""
+        return TileCover(tuple(range(len(self.index.tiles)))[-1:], np.inf)
+
     def overview(self) -> GaussianModel:
         """Return the Gaussians of the coarsest level."""
-        root = len(self.index.tiles) - 1
-        return self._load(root).model if root >= 0 else GaussianModel.empty(self.index.sh_degree)
+        return self._union(self.coarsest().numbers).model
+
+    def tile(self, number: int) -> GaussianModel:
+        """Return the Gaussians of a tile.
+
+        Raises:
+            FormatError: the tile is damaged.
+        """
+        return self._load(number).model
 
     def near(self, low: ArrayLike, high: ArrayLike, n_sigma: float = 2.0) -> MapPart:
         """Return all Gaussians whose ellipsoids may reach into a box, in the order of the map.
@@ -220,7 +250,20 @@ class TiledMap:
     def in_view(
         self, camera: Camera, T_world_camera: ArrayLike, *, pixel_error: float = CONSTANTS.pixel_error
     ) -> TiledView:
-        """Return the Gaussians that draw a view.
+        """Return the Gaussians that draw a view: those of its :meth:`cover`, with the same arguments.
+
+        Raises:
+            InputError: the error is negative or not finite, or the pose is not (4, 4) and finite.
+            FormatError: a tile is damaged.
+        """
+        cover = self.cover(camera, T_world_camera, pixel_error=pixel_error)
+        part = self._union(cover.numbers)
+        return TiledView(part.model, part.rows, cover.pixel_error, len(cover.numbers))
+
+    def cover(
+        self, camera: Camera, T_world_camera: ArrayLike, *, pixel_error: float = CONSTANTS.pixel_error
+    ) -> TileCover:
+        """Choose the tiles that draw a view, without reading them.
 
         From the root on, the tile of the largest error is replaced by its children in view. This ends when all errors
         are small enough, or when the memory is used. The error of a tile is the edge of its cells at the nearest depth
@@ -233,7 +276,6 @@ class TiledMap:
 
         Raises:
             InputError: the error is negative or not finite, or the pose is not (4, 4) and finite.
-            FormatError: a tile is damaged.
         """
         if not 0.0 <= pixel_error < np.inf:
             raise InputError(f"is {pixel_error}.", field="pixel_error", hint="give pixels, 0 or more")
@@ -243,8 +285,10 @@ class TiledMap:
         visible, depths = self._visible(camera, inverse(pose))
         errors = max(camera.fx, camera.fy) * np.array([tile.error for tile in self.index.tiles]) / depths
         chosen, reached = self._refined(visible, errors, pixel_error)
-        part = MapPart.union([MapPart.empty(self.index.sh_degree), *(self._load(number) for number in chosen)])
-        return TiledView(part.model, part.rows, reached, len(chosen))
+        return TileCover(tuple(chosen), reached)
+
+    def _union(self, numbers: Sequence[int]) -> MapPart:
+        return MapPart.union([MapPart.empty(self.index.sh_degree), *(self._load(number) for number in numbers)])
 
     def _refined(self, visible: NDArray[np.bool_], errors: Array, most: float) -> tuple[list[int], float]:
         """Return tiles that cover the view at an error [px] of at most ``most``, or at the least that memory allows."""

@@ -17,10 +17,9 @@ from splatbot.service_key import key_file, read_key
 from splatbot.services.access import Access
 from splatbot.services.settings import ServiceSettings
 from splatbot.services.store import MapStore
-from splatbot.services.viewer.tile_cover import ViewedTiles
 from splatbot.services.viewer.tiled_viewer import TiledViewer
 from splatbot.services.viewer.viewer import Viewer
-from splatbot.tiles import write_tiles
+from splatbot.tiles import TiledMap, write_tiles
 from tests.browser.chromium import Chromium
 from tests.unit.tiles.maps import building
 
@@ -68,7 +67,7 @@ def test_near_a_wall_the_picture_of_the_tiles_is_that_of_the_whole_map(browser: 
         whole = _steady(browser, whole_viewer, "house")
     finally:
         whole_viewer.stop()
-    tiles = ViewedTiles(tmp_path / "tiles", memory_mb=LIMIT * 76 / 1e6)
+    tiles = TiledMap(tmp_path / "tiles", memory_mb=LIMIT * 76 / 1e6)
     viewer = TiledViewer(tiles, Access(ServiceSettings()), port=0)
     viewer.start()
     try:

@@ -24,9 +24,8 @@ from splatbot.services.settings import ServiceSettings
 from splatbot.services.viewer import tile_browser
 from splatbot.services.viewer.scene import clearance_colors
 from splatbot.services.viewer.tile_browser import TileBrowserConstants
-from splatbot.services.viewer.tile_cover import ViewedTiles
 from splatbot.services.viewer.tiled_viewer import TiledViewer
-from splatbot.tiles import write_tiles
+from splatbot.tiles import TiledMap, write_tiles
 from splatbot.workspace import Workspace
 from tests.unit.services.viewer.viser_client import FOV, HEIGHT, WIDTH, Array, ViserClient
 from tests.unit.tiles.maps import SIDE, building
@@ -59,7 +58,7 @@ def open_viewer(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Open]
     opened: list[TiledViewer] = []
 
     def call(gaussians: int = N, place: Path = folder, **more: object) -> TiledViewer:
-        tiles = ViewedTiles(place, memory_mb=(gaussians + 0.5) * BYTES / 1e6)
+        tiles = TiledMap(place, memory_mb=(gaussians + 0.5) * BYTES / 1e6)
         viewer = TiledViewer(tiles, Access(ServiceSettings()), port=0, **more)  # type: ignore[arg-type]
         opened.append(viewer)
         viewer.start()
