@@ -15,17 +15,17 @@ import tyro
 
 from splatbot.cli.messages import set_interruption
 from splatbot.cli.paths import check_output, check_training
+from splatbot.cli.training_page import served_page, shown_on_page, viewer_port
 from splatbot.errors import InputError
 from splatbot.layouts import MAP_NAME, dataset_kind, log_kind
 
 if TYPE_CHECKING:
     from splatbot.gaussians import GaussianModel
     from splatbot.results.folder import RunFolder
-    from splatbot.services.live_training.server import LivePage
     from splatbot.training.datasets import TrainingData
     from splatbot.training.distributed import TrainingGroup
     from splatbot.training.folder import TrainingFolder, TrainingSettings
-    from splatbot.training.session import StepObserver, TrainingProgress, TrainingSession
+    from splatbot.training.session import TrainingProgress
 
 _DEFAULT_ITERATIONS = 7_000
 _WIDE_COLUMNS = 110  # of a terminal that shows all numbers
@@ -128,7 +128,7 @@ def train(
     if log is not None:
         log_kind(log)
     check_output(out)
-    port = _viewer_port(viewer)
+    port = viewer_port(viewer)
     if resume is None:
         set_interruption("interrupted; nothing was trained yet")
 
@@ -203,7 +203,7 @@ def _train(
         if len(signals) > 1 and waited_s > _PATIENCE_S:
             raise KeyboardInterrupt
 
-    with Interrupts() as interrupts, _page(port if group.leads else None) as page, _progress(quiet) as report:
+    with Interrupts() as interrupts, served_page(port if group.leads else None) as page, _progress(quiet) as report:
         interrupts.when_requested = lambda: signals.append(None)
         with _resumable(folder, lambda: begun), ExitStack() as processes:
             with interrupts.interruptible():
@@ -218,7 +218,7 @@ def _train(
                     folder.begin(settings)
                     begun = True
                 set_interruption()
-            with _shown(session, page, folder.path.name, quiet=quiet) as observe:
+            with shown_on_page(session, page, folder.path.name, quiet=quiet) as observe:
                 session.run(report=report, stop=lambda: interrupts.requested is not None, observe=observe)
         if not group.leads:
             return 0
@@ -232,49 +232,6 @@ def _train(
     if not quiet:
         _print(folder, data.folder / MAP_NAME if in_place else folder.map, scores, changes)
     return 0 if scores["complete"] else _interrupted(folder, interrupts.requested)
-
-
-def _viewer_port(given: tuple[int, ...] | None) -> int | None:
-    """Return the port of --viewer [PORT]; None without the option."""
-    if given is None:
-        return None
-    from splatbot.services.live_training.server import DEFAULT_PORT
-
-    if len(given) > 1 or not all(0 <= port <= 65535 for port in given):
-        raise InputError(f"is {' '.join(map(str, given))}.", field="--viewer", hint="give one port from 0 to 65535")
-    return given[0] if given else DEFAULT_PORT
-
-
-@contextmanager
-def _page(port: int | None) -> Iterator[LivePage | None]:
-    """Yield the page of --viewer, which is served during the block, and print its address; None without a port."""
-    if port is None:
-        yield None
-        return
-    from splatbot.services.live_training.server import HOST, LivePage
-    from splatbot.services.viewer.door import opening_address
-
-    with LivePage(port) as page:
-        address = opening_address(page.access, HOST, page.port, to_terminal=sys.stdout.isatty())
-        print(f"{address} shows the training", flush=True)
-        yield page
-
-
-@contextmanager
-def _shown(session: TrainingSession, page: LivePage | None, name: str, *, quiet: bool) -> Iterator[StepObserver]:
-    """Yield the observer that shows a training on a page, and print its share of the time after the block."""
-    if page is None:
-        yield lambda loss: None
-        return
-    from splatbot.services.live_training.viewer import LiveTraining
-
-    live = LiveTraining(session, page, name)
-    try:
-        yield live
-    finally:
-        live.end()
-    if not quiet:
-        print(f"the viewer took {100 * live.budget.used:.1f} % of the time", flush=True)
 
 
 @contextmanager
