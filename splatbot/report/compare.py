@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from splatbot.rasterize.views import colorize, depth_limits
 from splatbot.report.images import DIFFERENCE_GAIN, colour_png, difference_png
 from splatbot.report.parts import document, note, pictures, section, table, tiles
-from splatbot.results.units import count, decibels, megabytes, number, percent
+from splatbot.results.units import count, decibels, megabytes, millimetres, number, percent
 from splatbot.training.comparison import ComparedView
 
 _WIDEST = 720  # [px] of an image under a slider
@@ -102,6 +102,12 @@ def comparison_rows(a: PageMap, b: PageMap, means: Mapping[str, float | None]) -
         rows += [
             ("PSNR against the recording", decibels(means["psnr_a_db"]), decibels(means["psnr_b_db"])),
             ("SSIM against the recording", number(means["ssim_a"], 3), number(means["ssim_b"], 3)),
+        ]
+    if "depth_error_a" in means:
+        errors = (millimetres(means[f"depth_error_{name}"]) for name in ("a", "b"))
+        rows += [
+            ("median error to measured depth", *errors),
+            ("measured pixels covered", percent(means["measured_a"]), percent(means["measured_b"])),
         ]
     return rows
 

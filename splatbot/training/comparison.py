@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatbot.camera import Camera
+from splatbot.evaluation.geometry import depth_error
 from splatbot.evaluation.image import psnr, ssim
 from splatbot.gaussians import GaussianModel
 from splatbot.rasterize.views import render_rgbd
@@ -67,9 +68,10 @@ class ComparedView:
         a, b: the maps.
         recorded: (H, W, 3); None if the view is not recorded.
         scores: figures by name. ``psnr_db`` and ``ssim`` are those of B against A. ``psnr_a_db``, ``ssim_a``,
-            ``psnr_b_db`` and ``ssim_b`` are against the recorded image, if there is one. ``covered_a``, ``covered_b``
-            and ``overlap`` are shares of pixels. ``depth_difference`` is the median share of the depth, where both
-            maps have depth.
+            ``psnr_b_db`` and ``ssim_b`` are against the recorded image, if there is one. ``depth_error_a`` and
+            ``depth_error_b`` are medians [m] over measured depth that the map covers, ``measured_a`` and ``measured_b``
+            the covered shares of measured pixels. ``covered_a``, ``covered_b`` and ``overlap`` are shares of pixels.
+            ``depth_difference`` is the median share of the depth, where both maps have depth.
     """
 
     name: str
@@ -104,6 +106,9 @@ def compare_recorded(
         scores = _scores(seen_a, seen_b)
         for name, seen in (("a", seen_a), ("b", posed_b)):
             scores[f"psnr_{name}_db"], scores[f"ssim_{name}"] = _against(seen.rgb, recorded, counted)
+            if photo.depth is not None:
+                error = depth_error(seen.depth, photo.depth)
+                scores[f"depth_error_{name}"], scores[f"measured_{name}"] = error.median, error.coverage
         yield ComparedView(view.name, seen_a, seen_b, recorded, scores)
 
 

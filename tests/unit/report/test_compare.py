@@ -50,3 +50,6 @@ def test_scores_against_a_recording_have_rows_where_there_is_one() -> None:
     assert "PSNR against the recording" not in names
     scored = means | {"psnr_a_db": 25.0, "ssim_a": 0.8, "psnr_b_db": None, "ssim_b": None}
     assert ("PSNR against the recording", "25.0 dB", "-") in comparison_rows(A, B, scored)
+    assert "median error to measured depth" not in [row[0] for row in comparison_rows(A, B, scored)]
+    measured = scored | {"depth_error_a": 0.0031, "depth_error_b": None, "measured_a": 0.9, "measured_b": 0.0}
+    assert ("median error to measured depth", "3.10 mm", "-") in comparison_rows(A, B, measured)

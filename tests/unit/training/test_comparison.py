@@ -10,7 +10,9 @@ import torch
 
 from splatbot.evaluation.image import psnr
 from splatbot.gaussians import GaussianModel
+from splatbot.rasterize.views import render_rgbd
 from splatbot.training.comparison import compare_around, compare_recorded, doubts, summary
+from splatbot.training.datasets.base import TrainingView
 from splatbot.training.map_views import MapViews
 from splatbot.training.options import TrainingOptions
 from tests.unit.training.rendered import CAMERA, rendered_data, true_model
@@ -76,6 +78,23 @@ def test_a_map_is_scored_from_the_poses_of_its_own_run() -> None:
     (posed,) = compare_recorded(true_model(), b, views, of_b, 1)
     assert posed.scores["psnr_b_db"] > 40 > alone.scores["psnr_b_db"]  # type: ignore[operator]
     assert posed.scores["psnr_db"] == alone.scores["psnr_db"]
+
+
+def test_maps_are_scored_against_measured_depth_where_it_is() -> None:
+    views, model = recorded(), true_model()
+    away = 0.02  # [m]
+
+    def with_depth(view: TrainingView) -> TrainingView:
+        depth = render_rgbd(model, view.camera, view.T_world_camera)[2] + np.float32(away)
+        depth[:, : CAMERA.width // 2] = 0  # nothing is measured there
+        return replace(view, read_depth=depth.copy)
+
+    measured = replace(views, held_out=tuple(map(with_depth, views.held_out)))
+    (view,) = compare_recorded(model, moved(model, 50.0), measured, None, 1)
+    assert view.scores["depth_error_a"] == pytest.approx(away, rel=1e-3)
+    assert view.scores["measured_a"] == pytest.approx((view.a.depth[:, CAMERA.width // 2 :] > 0).mean())
+    assert view.scores["depth_error_b"] is None
+    assert view.scores["measured_b"] == 0
 
 
 def test_masked_pixels_do_not_count_against_the_recording() -> None:
