@@ -104,9 +104,9 @@ def comparison_rows(a: PageMap, b: PageMap, means: Mapping[str, float | None]) -
             ("SSIM against the recording", number(means["ssim_a"], 3), number(means["ssim_b"], 3)),
         ]
     if "depth_error_a" in means:
-        errors = (millimetres(means[f"depth_error_{name}"]) for name in ("a", "b"))
+        of_a, of_b = (millimetres(means[f"depth_error_{name}"]) for name in ("a", "b"))
         rows += [
-            ("median error to measured depth", *errors),
+            ("median error to measured depth", of_a, of_b),
             ("measured pixels covered", percent(means["measured_a"]), percent(means["measured_b"])),
         ]
     return rows
