@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from splatbot.camera import Camera
 from splatbot.errors import InputError
+from splatbot.imu import ImuSamples
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +69,8 @@ class Frame:
             are not synchronized.
         joint_names: names of ``joints``. If empty, they are in the order of the robot.
         camera_name: name of the camera where several cameras map; empty for the first one.
+        imu: samples of the camera's inertial sensor since the previous frame, on the clock of ``stamp``. If None, there
+            is no sensor or its axes are unknown.
 
     Raises:
         InputError: sizes differ, a type is wrong or depth is negative.
@@ -85,6 +88,7 @@ class Frame:
     depth_delay: float = 0.0
     joint_names: tuple[str, ...] = ()
     camera_name: str = ""
+    imu: ImuSamples | None = field(default=None, compare=False)
 
     def __post_init__(self) -> None:
         where = self.source or f"frame {self.index}"
@@ -133,6 +137,11 @@ class Frame:
                 field="depth",
                 hint="depth is the distance along the optical axis in metres, 0 where missing",
             )
+
+    def shifted(self, seconds: float) -> Frame:
+        """Return the frame with a time [s] added to its stamps."""
+        imu = None if self.imu is None else self.imu.shifted(seconds)
+        return replace(self, stamp=self.stamp + seconds, imu=imu)
 
     @property
     def valid(self) -> NDArray[np.bool_]:

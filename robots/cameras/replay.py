@@ -195,7 +195,7 @@ class ReplayCamera:
                 due = begun[0] + (stamp - begun[1]) / self.options.speed + late
                 if closed.wait(max(due - time.monotonic(), 0.0)):
                     return
-                yield number, replace(frame, stamp=stamp, index=number)
+                yield number, replace(frame.shifted(offset), index=number)
                 period, last = (frame.stamp - last if last else 0.0), frame.stamp
                 number += 1
             if not self.options.loop:

@@ -148,7 +148,7 @@ class CameraRig:
         """Collect the frames of one camera; the oldest is dropped when there are too many."""
         try:
             for frame in part.camera:
-                named = replace(frame, stamp=frame.stamp + part.time_offset, camera_name=part.name)
+                named = replace(frame.shifted(part.time_offset), camera_name=part.name)
                 with self._changed:
                     if len(part.waiting) == _WAITING:
                         part.waiting.popleft()

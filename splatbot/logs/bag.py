@@ -18,6 +18,7 @@ from rosbags.interfaces import Connection
 from splatbot.camera import Camera
 from splatbot.errors import InputError, LogError
 from splatbot.frame import Frame
+from splatbot.imu import ImuSamples
 from splatbot.logs.address import PAIR_WITHIN, join_address, seconds_of_option
 from splatbot.logs.base import MILLIMETRES, StampedLog
 from splatbot.logs.calibration import Calibration
@@ -39,15 +40,17 @@ from splatbot.logs.ros_frames import (
     seconds_of,
     to_nanoseconds,
 )
+from splatbot.logs.ros_imu import TYPE as IMU
+from splatbot.logs.ros_imu import RecordedImu
 from splatbot.logs.ros_transforms import TF, TF_STATIC, StampedTransform, static_transform, transforms_of
 from splatbot.logs.ros_types import Message, typestore
 from splatbot.logs.streams import bag_streams, header_stamp, obstacle_to_mapping
-from splatbot.logs.undistort import Undistorter
 from splatbot.protocols import Array
 from splatbot.trajectory import Trajectory
 
 KEYS = ("color", "depth", "info", "joints", "registered", PAIR_WITHIN)
 _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+_BEFORE_FIRST_S = 0.05
 _T = TypeVar("_T")
 
 _log = logging.getLogger(__name__)
@@ -72,8 +75,9 @@ class BagLog(StampedLog):
 
     Colour images without depth within 0.02 s, or the option `pair_within`, are skipped and counted in ``unpaired``. If
     recorded, joint positions are read from /joint_states, masks (white pixels are valid) from /camera/mask/image_raw
-    and reference poses from /ground_truth/pose. Frames are :class:`splatbot.logs.ros_frames.RosFrame`; they are decoded
-    on access, and the file stays open. The class is not thread-safe.
+    and reference poses from /ground_truth/pose. Imu topics give the samples of the IMU, if /tf_static connects their
+    frames to the camera. Frames are :class:`splatbot.logs.ros_frames.RosFrame`; they are decoded on access, and the
+    file stays open. The class is not thread-safe.
 
     Where depth is of another camera by its frame_id or size, colour is put at its pixels. Its camera_info and
     /tf_static describe the two cameras (:class:`splatbot.logs.ros_cameras.CameraPair`).
@@ -114,7 +118,6 @@ class BagLog(StampedLog):
             find_calibration(camera) if camera is not None else Calibration(self._recorded_camera(), MILLIMETRES)
         )
         self._cameras = self._camera_pair()
-        self._undistort_mask = Undistorter(self._cameras.color) if self._cameras.color.distortion else None
 
     @property
     def camera(self) -> Camera:
@@ -137,13 +140,12 @@ class BagLog(StampedLog):
 
     def accelerations(self) -> dict[str, NDArray[np.float64]]:
         """Return stamps [s] and specific forces [m/s²] (N, 4) of each topic of sensor_msgs/Imu that has them."""
-        topics = sorted({c.topic for c in self._reader.connections if c.msgtype == "sensor_msgs/msg/Imu"})
-        found = {}
-        for topic in topics:
-            measured = [m for m in self._all(topic) if m.linear_acceleration_covariance[0] != -1]  # -1: not measured
-            vectors = [(m.header.stamp, m.linear_acceleration) for m in measured]
-            found[topic] = np.array([(seconds_of(stamp), a.x, a.y, a.z) for stamp, a in vectors]).reshape(-1, 4)
-        return found
+        return self._imu_messages.accelerations()
+
+    @cached_property
+    def imu(self) -> ImuSamples | None:
+        """Samples of the whole recording in the axes of the frames; None if no Imu topic has known axes."""
+        return self._imu_messages.samples(self._camera_frame, self._static_transform)
 
     @property
     def has_transforms(self) -> bool:
@@ -166,8 +168,6 @@ class BagLog(StampedLog):
         names, joints = self._joints.at(color.stamp + self._joint_delay) or ((), None)
         try:
             rgb, z = self._cameras.images(rgb, z)
-            if mask is not None and self._undistort_mask is not None:
-                mask = self._undistort_mask.mask(mask)
             return RosFrame(
                 color.stamp,
                 rgb,
@@ -175,14 +175,22 @@ class BagLog(StampedLog):
                 self._cameras.camera,
                 index,
                 joints=joints,
-                mask=mask,
+                mask=None if mask is None else self._cameras.mask(mask),
                 source=where,
                 depth_delay=depth.stamp - color.stamp,
                 joint_names=names,
                 camera_frame=self._camera_frame,
+                imu=self._imu_samples(index),
             )
         except InputError as error:
             raise LogError(error.message, file=where, field=error.field, hint=error.hint) from error
+
+    def _imu_samples(self, index: int) -> ImuSamples | None:
+        """Return the samples since the frame before, or those shortly before the first frame."""
+        if self.imu is None:
+            return None
+        stamp = self.stamps[index]
+        return self.imu.between(self.stamps[index - 1] if index else stamp - _BEFORE_FIRST_S, stamp)
 
     def _camera_pair(self) -> CameraPair:
         """Return the cameras of colour and depth by the headers of their first messages.
@@ -289,12 +297,17 @@ class BagLog(StampedLog):
         raise LogError(f"holds {problem}.", file=self.path, field=key, hint=hint)
 
     def _scan(self) -> dict[str, list[_Entry]]:
-        """Index the images by topic, sorted by stamp; only message headers are parsed."""
-        wanted = [c for c in self._reader.connections if c.topic in (self._color, self._depth, MASK)]
+        """Index the images by topic, sorted by stamp, of which only headers are parsed, and read the Imu messages."""
+        images = (self._color, self._depth, MASK)
+        wanted = [c for c in self._reader.connections if c.topic in images or c.msgtype == IMU]
+        self._imu_messages = RecordedImu()
         found: dict[str, list[_Entry]] = defaultdict(list)
         seen: dict[tuple[str, int], int] = defaultdict(int)
         try:
             for connection, received, raw in self._reader.messages(wanted):
+                if connection.msgtype == IMU:
+                    self._imu_messages.add(connection.topic, self._reader.deserialize(raw, connection.msgtype))
+                    continue
                 key = connection.topic, received
                 stamp = header_stamp(raw, ros2=self._reader.is2)
                 found[connection.topic].append(_Entry(stamp, received, seen[key]))

@@ -86,7 +86,7 @@ class ConsecutiveLog(StampedLog):
     def _decode(self, index: int) -> Frame:
         number = bisect_right(self._begins, index) - 1
         frame = self._logs[number].read(index - self._begins[number])
-        return replace(frame, index=index, stamp=frame.stamp + self._offsets[number])
+        return replace(frame.shifted(self._offsets[number]), index=index)
 
     def _wrong(self, field: str, message: str, hint: str) -> LogError:
         return LogError(message, file=self._file, field=field, hint=hint)

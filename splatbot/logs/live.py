@@ -25,6 +25,7 @@ from splatbot.logs.ros_frames import to_nanoseconds
 from splatbot.protocols import FrameSource
 from splatbot.trajectory import Trajectory
 
+_IMU_S = 2.0  # time of the samples of frames that the reader misses, which bounds their number
 _LATE_S = 10.0  # time of frames whose stamps do not increase, after which the clock of the camera was set back
 
 _log = logging.getLogger(__name__)
@@ -229,6 +230,9 @@ class RecordedCamera(LogBase):
         """Write a frame, and keep it for the reader as the recording has it."""
         write_frame(self._files[frame.camera_name], frame)
         with self._changed:
+            missed = self._newest.get(frame.camera_name)
+            if missed is not None and frame.imu is not None:  # the reader has the samples of the frames that it misses
+                frame = replace(frame, imu=frame.imu.joined(missed[1].imu).between(frame.stamp - _IMU_S, frame.stamp))
             self._newest[frame.camera_name] = self._count, frame
             self._count += 1
             self._changed.notify_all()

@@ -23,6 +23,7 @@ from splatbot.logs.ros_frames import (
     pose_stamped_message,
     to_nanoseconds,
 )
+from splatbot.logs.ros_imu import imu_messages
 from splatbot.logs.ros_types import Message, to_cdr, type_of, typestore
 
 COLOR, DEPTH, INFO = "/camera/color/image_raw", "/camera/depth/image_raw", "/camera/color/camera_info"
@@ -109,7 +110,7 @@ def recover_mcap(path: str | Path) -> None:
 def record_mcap(log: Log, path: str | Path, *, progress: Progress | None = None) -> Path:
     """Write a log's frames, intrinsics, joints, masks and reference poses; reading returns bit-identical frames.
 
-    Depth is 32FC1 [m], so nothing is rounded. Stamps are kept to the nanosecond.
+    Depth is 32FC1 [m], so nothing is rounded, and samples of the IMU are float64. Stamps are kept to the nanosecond.
 
     Args:
         progress: called with the number of frames written so far.
@@ -129,12 +130,14 @@ def record_mcap(log: Log, path: str | Path, *, progress: Progress | None = None)
 
 
 def write_frame(out: McapFile, frame: Frame) -> None:
-    """Add the intrinsics, images, mask and joints of a frame.
+    """Add the intrinsics, images, mask, joints and IMU samples of a frame.
 
     Raises:
         OSError: the disk is full or not available.
     """
     at = to_nanoseconds(frame.stamp)
+    for sampled, topic, message in () if frame.imu is None else imu_messages(frame.imu):
+        out.write(topic, message, sampled)
     out.write(INFO, camera_info_message(frame.stamp, frame.camera), at)
     out.write(COLOR, image_message(frame.stamp, frame.rgb), at)
     out.write(DEPTH, image_message(frame.stamp + frame.depth_delay, frame.depth), at)

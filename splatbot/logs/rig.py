@@ -109,7 +109,7 @@ class RigLog(StampedLog):
         part = self.parts[number]
         frame = part.log.read(at)
         name = part.name if number else ""
-        return replace(frame, index=index, stamp=frame.stamp + part.time_offset, camera_name=name)
+        return replace(frame.shifted(part.time_offset), index=index, camera_name=name)
 
     def _part(self, name: str, values: Mapping[str, Any], opener: Opener) -> RigCamera:
         camera, address = values.get("camera"), local_address(self._file, values["log"])

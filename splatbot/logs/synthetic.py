@@ -12,11 +12,13 @@ from numpy.typing import NDArray
 from splatbot.camera import Camera
 from splatbot.errors import InputError, LogError
 from splatbot.frame import Frame
+from splatbot.imu import ImuSamples
 from splatbot.logs.base import MILLIMETRES, StampedLog
 from splatbot.logs.calibration import Calibration
 from splatbot.logs.effects import Account, FrameEffects, make_effects
 from splatbot.logs.scenes import SCENES, RaycastScene, SceneKind
-from splatbot.logs.trajectories import MotionOptions, make_path
+from splatbot.logs.simulated_imu import SimulatedImu
+from splatbot.logs.trajectories import MotionOptions, Path, make_path
 from splatbot.trajectory import Trajectory
 
 PREFIX = "synthetic:"
@@ -36,8 +38,9 @@ class SyntheticOptions:
         rate: frame rate [Hz].
         arc: angle of an orbit [deg].
         event: time [s] at which an object moves or vanishes in dynamic scenes.
-        seed: seed of hand jitter and of the effects.
+        seed: seed of hand jitter, of the effects and of the errors of the IMU.
         effects: sensor effects, `name:option=value,...` separated by semicolons.
+        imu: rate [Hz] of the simulated inertial sensor (:mod:`splatbot.logs.simulated_imu`); 0 for none.
     """
 
     trajectory: str = ""
@@ -49,6 +52,7 @@ class SyntheticOptions:
     event: float = 2.0
     seed: int = 0
     effects: str = ""
+    imu: float = 0.0
 
 
 _BOUNDS: dict[str, tuple[float, float]] = {
@@ -59,6 +63,7 @@ _BOUNDS: dict[str, tuple[float, float]] = {
     "arc": (0, 120),
     "event": (0, 1e6),
     "seed": (0, 2**32 - 1),
+    "imu": (0, 2000),
 }
 
 
@@ -143,7 +148,7 @@ class SyntheticLog(StampedLog):
         i = self._kept[index]
         stamp = float(self.ground_truth.stamps[i])
         rgb, depth = self.scene.render(self.camera, self.ground_truth.T_world_camera[i], stamp)
-        frame = Frame(stamp, rgb, depth, self.camera, i, source=f"{self.uri}#{i}")
+        frame = Frame(stamp, rgb, depth, self.camera, i, source=f"{self.uri}#{i}", imu=self._imu_samples(index))
         if self._effects is not None:
             frame = self._effects(frame)
         return frame if i == index else replace(frame, index=index)
@@ -155,11 +160,25 @@ class SyntheticLog(StampedLog):
 
     def _path(self, samples: int = 1) -> Trajectory:
         """Sample the camera path at the frames, and at ``samples - 1`` equally spaced times between two of them."""
-        o = self.options
-        motion = MotionOptions((o.frames - 1) / o.rate, o.rate, np.radians(o.arc), o.seed)
-        path = make_path(o.trajectory or self.kind.trajectory, self.kind.stage, motion)
+        o, path = self.options, self._motion()
         stamps = np.arange((o.frames - 1) * samples + 1) / (o.rate * samples)
         return Trajectory(stamps, np.array([path(float(t)) for t in stamps]))
+
+    def _motion(self) -> Path:
+        o = self.options
+        motion = MotionOptions((o.frames - 1) / o.rate, o.rate, np.radians(o.arc), o.seed)
+        return make_path(o.trajectory or self.kind.trajectory, self.kind.stage, motion)
+
+    @cached_property
+    def _imu(self) -> SimulatedImu | None:
+        return SimulatedImu(self._motion(), self.options.imu, self.options.seed) if self.options.imu else None
+
+    def _imu_samples(self, index: int) -> ImuSamples | None:
+        """Return the samples since the kept frame before a frame; at the first one, the sample at its stamp."""
+        if self._imu is None:
+            return None
+        after = self.stamps[index - 1] if index else self.stamps[0] - 1 / self.options.imu
+        return self._imu.samples(after, self.stamps[index])
 
     def _make_effects(self) -> FrameEffects | None:
         specs = [spec.strip() for spec in self.options.effects.split(";") if spec.strip()]
