@@ -152,6 +152,10 @@ class HasHand(Protocol):
         ...
 
 
+class ArmWithHand(RobotKinematics, HasHand, Protocol):
+    """An arm that can grasp objects."""
+
+
 class MotionState(StrEnum):
     """State of a controller."""
 

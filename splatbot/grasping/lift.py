@@ -102,7 +102,6 @@ def in_hand(arm: RobotSpheres, q: Array, spheres: Array) -> Array:
 
 def raised(sampler: GraspSampler, arm: RobotSpheres, q: Array, height: float) -> Array:
     """Return the tool pose T_world_tcp (4, 4) at ``q`` (J,), raised by ``height`` [m] along the up axis."""
-    tool = np.asarray(sampler.robot.T_link_tcp, dtype=np.float64)  # type: ignore[attr-defined]
-    T = np.asarray(arm.forward(q[None])[0, -1] @ tool)
+    T = np.asarray(arm.forward(q[None])[0, -1] @ sampler.robot.T_link_tcp)
     T[:3, 3] += height * sampler.scene.up
     return T

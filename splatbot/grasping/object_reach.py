@@ -13,7 +13,7 @@ from splatbot.gaussians import GaussianModel
 from splatbot.geometry import inverse, transform_points
 from splatbot.grasping.hands import CONSTANTS as HANDS
 from splatbot.grasping.obstacles import around_target
-from splatbot.grasping.reach import hand_of
+from splatbot.grasping.reach import with_hand
 from splatbot.planning.causes import collision
 from splatbot.planning.ik import ArmWithTool, solve_ik
 from splatbot.planning.problem import Cause
@@ -95,7 +95,8 @@ class _Clearance:
         around = around_target(scene, item.rows)
         whole = GaussianCollisionField(around if solids is None else GaussianModel.concatenate([around, solids]))
         of_fingers = around_target(scene, np.concatenate([item.rows, _rows_of_support(scene, item)]))
-        opening = min(float(item.size[1]) + 2 * HANDS.min_pad_gap, hand_of(robot).stroke)
+        _, hand = with_hand(robot)
+        opening = min(float(item.size[1]) + 2 * HANDS.min_pad_gap, hand.stroke)
         arm = RobotSpheres(robot, T_world_base=scene.T_world_base, opening=opening)
         palm = RobotSpheres(_Palm(robot), T_world_base=scene.T_world_base)
         links = _Check(arm.without_hand(margin), whole, f"the map or its {1e3 * margin:.1f} mm margin")

@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import rotation_to_quat
+from splatbot.grasping.attached import within
 from splatbot.planning.cartesian import StraightResult
+from splatbot.protocols import Array
 from splatbot.segmentation import SegmentedMap
 
 _SUPPORT_STD_M = 1e-3  # standard deviation of a support's Gaussians along the normal of its plane
@@ -47,6 +49,18 @@ def around_target(scene: SegmentedMap, rows: NDArray[np.int64]) -> GaussianModel
 def rows_around(scene: SegmentedMap, rows: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the rows (K,) of the map that remain without the target's ``rows`` (M,), in their order."""
     return np.setdiff1d(np.arange(len(scene.model)), rows)
+
+
+def rows_without_strays(around: GaussianModel, spheres: Array) -> NDArray[np.int64]:
+    """Return the rows (K,) of a map without its target that are not inside of the target, in their order.
+
+    Gaussians inside of it are its own strays, which segmentation did not assign to it. They move with it.
+
+    Args:
+        around: the map without the target.
+        spheres: (A, 4) spheres (x, y, z, radius) that cover the target [m, world].
+    """
+    return np.flatnonzero(~within(around.means.detach().double().numpy(), spheres))
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,11 +13,10 @@ from numpy.typing import ArrayLike
 from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.errors import InputError
 from splatbot.grasping.affordance import Target
-from splatbot.grasping.attached import within
 from splatbot.grasping.hands import CONSTANTS as HANDS
 from splatbot.grasping.lift import Lift, lift_target, target_spheres
 from splatbot.grasping.moved_target import moved_grasp, moved_sampler
-from splatbot.grasping.obstacles import Surfaces, around_target, rows_around
+from splatbot.grasping.obstacles import Surfaces, around_target, rows_around, rows_without_strays
 from splatbot.grasping.pick_types import PickOptions
 from splatbot.grasping.reach import LinkGuard, link_guards
 from splatbot.grasping.sampler import GraspSampler
@@ -140,11 +139,10 @@ class MapPickPlanner:
         self._T = sampler.scene.T_world_base
         self._object = target_spheres(sampler, target)
         around = around_target(sampler.scene, target.rows)
-        # Gaussians inside of the target are its own strays, which segmentation did not assign to it.
-        inside = within(around.means.detach().double().numpy(), self._object)
-        around_held = around.select(torch.from_numpy(~inside))
+        rest = rows_without_strays(around, self._object)
+        around_held = around.select(torch.from_numpy(rest))
         rows = rows_around(sampler.scene, target.rows)
-        self._surfaces, self._surfaces_held = Surfaces(sampler.scene, rows), Surfaces(sampler.scene, rows[~inside])
+        self._surfaces, self._surfaces_held = Surfaces(sampler.scene, rows), Surfaces(sampler.scene, rows[rest])
         field = sampler.collision_field
         whole = sampler.field if sampler.departure is None else sampler.departure
         self._static = _Obstacles(whole, field(around), field(around_held))

@@ -16,7 +16,7 @@ from splatbot.grasping.hands import CONSTANTS as HANDS
 from splatbot.planning.cartesian import StraightResult, along, straight_line
 from splatbot.planning.goals import goal_configurations
 from splatbot.planning.problem import PlanStatus, PoseGoal
-from splatbot.protocols import Array, HandShape, HasHand, RobotKinematics
+from splatbot.protocols import ArmWithHand, Array, HandShape, HasHand, RobotKinematics
 
 
 @dataclass(frozen=True)
@@ -129,20 +129,19 @@ class ReachabilityCheck(Protocol):
         ...
 
 
-def hand_of(robot: RobotKinematics) -> HandShape:
-    """Return the shape of the robot's hand.
+def with_hand(robot: RobotKinematics) -> tuple[ArmWithHand, HandShape]:
+    """Return a robot as an arm with a hand, and the shape of the hand.
 
     Raises:
         InputError: the robot has no fingers.
     """
-    hand = robot.hand if isinstance(robot, HasHand) else None
-    if hand is None:
+    if not isinstance(robot, HasHand) or robot.hand is None:
         raise InputError(
             "has no fingers.",
             field=robot.name,
             hint="take a robot with a gripper, as panda or ur5e-2f85 (`splatbot robot list` has all)",
         )
-    return hand
+    return robot, robot.hand
 
 
 class ArmReach:
@@ -180,14 +179,14 @@ class ArmReach:
         for name, value in (("margin", margin), ("arm_margin", arm_margin)):
             if not 0.0 <= value < np.inf:
                 raise InputError(f"is {value}.", field=name, hint="give metres, 0 or more")
-        self.robot, self.around, self.whole, self.seed = robot, around, whole, seed
+        self.robot, hand = with_hand(robot)
+        self.around, self.whole, self.seed = around, whole, seed
         self.around_held = around if around_held is None else around_held
         self.departure = departure
-        stroke = hand_of(robot).stroke
 
         @cache
         def arm(steps: int) -> RobotSpheres:
-            width = min(steps * HANDS.opening_step, stroke)
+            width = min(steps * HANDS.opening_step, hand.stroke)
             return RobotSpheres(robot, T_world_base=T_world_base, opening=width, margin=margin)
 
         self._arm = arm

@@ -14,7 +14,7 @@ from splatbot.gaussians import GaussianModel
 from splatbot.grasping.affordance import Target
 from splatbot.grasping.measured import RawDepth
 from splatbot.grasping.options import GraspOptions
-from splatbot.grasping.reach import ArmReach, ReachabilityCheck, hand_of
+from splatbot.grasping.reach import ArmReach, ReachabilityCheck, with_hand
 from splatbot.grasping.search import Search
 from splatbot.grasping.shape_completion import target_surface
 from splatbot.grasping.surface import GraspSurface
@@ -73,9 +73,9 @@ class GraspSampler:
             raise InputError(f"is {observers.shape}.", field="observers", hint=f"give ({len(scene.model)}, 3)")
         if not 0.0 <= margin < np.inf:
             raise InputError(f"is {margin}.", field="margin", hint="give metres, 0 or more")
-        self.scene, self.robot, self.observers, self.views = scene, robot, observers, tuple(views)
+        self.robot, self.hand = with_hand(robot)
+        self.scene, self.observers, self.views = scene, observers, tuple(views)
         self.raw = raw
-        self.hand = hand_of(robot)
         self.margin, self.arm_margin, self.n_sigma = margin, arm_margin, n_sigma
         self.departure: GaussianCollisionField | None = None
         self.departure_avoiding: GaussianCollisionField | None = None

@@ -16,14 +16,14 @@ from splatbot.collision import GaussianCollisionField
 from splatbot.gaussians import GaussianModel
 from splatbot.grasping.affordance import Target
 from splatbot.grasping.antipodal import Pairs, PairSearch, antipodal_pairs
-from splatbot.grasping.attached import object_spheres, within
+from splatbot.grasping.attached import object_spheres
 from splatbot.grasping.doubts import doubt, part_note
 from splatbot.grasping.hands import CONSTANTS as HANDS
 from splatbot.grasping.hands import Hands, measure_hands, palm_free, place_hands, usable_opening
 from splatbot.grasping.lift import lift_target, target_spheres
 from splatbot.grasping.measured import CONSTANTS as MEASURED
 from splatbot.grasping.measured import RawDepth, blind, closed_width, contact_distances, hand_penetration
-from splatbot.grasping.obstacles import Surfaces, around_target, rows_around
+from splatbot.grasping.obstacles import Surfaces, around_target, rows_around, rows_without_strays
 from splatbot.grasping.options import GraspOptions
 from splatbot.grasping.pick_types import PickOptions
 from splatbot.grasping.reach import BLOCKED, ReachabilityCheck
@@ -168,15 +168,19 @@ class Search:
         if self.s.raw is not None:
             scored = self._outside_measured(scored)
             self.log.stage("measured depth")
-        reach = self.s.reach(self.around, self._around_held())
+        around_held, _ = self._around_held(object_spheres(self.surface))
+        reach = self.s.reach(self.around, around_held)
         grasps = self._reached(scored, reach, self.s.reach_avoiding_moving(self.model))
         self.log.stage("reach")
         return grasps
 
-    def _around_held(self) -> GaussianCollisionField:
-        """Return the field without stray Gaussians inside of the target, which move with it."""
-        inside = within(self.model.means.detach().double().numpy(), object_spheres(self.surface))
-        return self.s.collision_field(self.model.select(torch.from_numpy(~inside))) if inside.any() else self.around
+    def _around_held(self, spheres: Array) -> tuple[GaussianCollisionField, Surfaces]:
+        """Return the field without strays inside of the target, which spheres (A, 4) cover, and its surfaces."""
+        rest = rows_without_strays(self.model, spheres)
+        surfaces = Surfaces(self.s.scene, rows_around(self.s.scene, self.target.rows)[rest])
+        if len(rest) == len(self.model):
+            return self.around, surfaces
+        return self.s.collision_field(self.model.select(torch.from_numpy(rest))), surfaces
 
     def _contacts(self, samples: int) -> None:
         self.found: PairSearch = antipodal_pairs(
@@ -374,10 +378,7 @@ class Search:
     def _lift(self) -> Callable[[Array, float], str]:
         """Return a check of the lift at joint positions (J,) and a width [m], as plans of picks make it; "" is free."""
         o, spheres = PickOptions(), target_spheres(self.s, self.target)
-        rows = rows_around(self.s.scene, self.target.rows)
-        rest = np.flatnonzero(~within(self.model.means.detach().double().numpy(), spheres))
-        field = self.s.collision_field(self.model.select(torch.from_numpy(rest)))
-        surfaces = Surfaces(self.s.scene, rows[rest])
+        field, surfaces = self._around_held(spheres)
 
         def reason(q: Array, width: float) -> str:
             found = lift_target(self.s, spheres, field, surfaces, q, width, lift_off=o.lift_off, height=o.lift)

@@ -11,7 +11,7 @@ from splatbot.collision import GaussianCollisionField, boxes_in_collision
 from splatbot.geometry import inverse, rotation_to_quat, transform_points
 from splatbot.grasping.hands import CONSTANTS as HANDS
 from splatbot.grasping.hands import Hands
-from splatbot.protocols import Array, HandShape, HasHand, RobotKinematics
+from splatbot.protocols import ArmWithHand, Array, HandShape
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class SweepConstants:
 CONSTANTS = SweepConstants()
 
 
-def swept_clearance(robot: RobotKinematics, hands: Hands, field: GaussianCollisionField, *, retreat: float) -> Array:
+def swept_clearance(robot: ArmWithHand, hands: Hands, field: GaussianCollisionField, *, retreat: float) -> Array:
     """Compute the clearance (K,) [m] of the last link's spheres at five poses of an approach of ``retreat`` [m].
 
     Values are clipped to 3 cm. The continuous path between the poses is certified later for the whole arm, see
@@ -41,13 +41,13 @@ def swept_clearance(robot: RobotKinematics, hands: Hands, field: GaussianCollisi
     return _clearance(robot, hands, field, back=np.linspace(0.0, retreat, CONSTANTS.samples), cut=HANDS.max_clearance)
 
 
-def finger_clearance(robot: RobotKinematics, hands: Hands, field: GaussianCollisionField, hand: HandShape) -> Array:
+def finger_clearance(robot: ArmWithHand, hands: Hands, field: GaussianCollisionField, hand: HandShape) -> Array:
     """Compute the clearance (K,) [m] of the finger spheres at the grasp, clipped to 1 mm; a quick test."""
     return _clearance(robot, hands, field, back=np.zeros(1), cut=CONSTANTS.box_tolerance, ahead=-hand.palm)
 
 
 def _clearance(
-    robot: RobotKinematics,
+    robot: ArmWithHand,
     hands: Hands,
     field: GaussianCollisionField,
     *,
@@ -59,7 +59,6 @@ def _clearance(
 
     Only spheres with z > ``ahead`` [m] in the frame of the tool count.
     """
-    assert isinstance(robot, HasHand)
     T_tcp_link = inverse(robot.T_link_tcp)
     clearance = np.full(len(hands), cut)
     alike = (np.flatnonzero(hands.opening == opening) for opening in np.unique(hands.opening))

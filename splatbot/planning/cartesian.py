@@ -93,8 +93,7 @@ def straight_line(
         GoalError: the end is no rigid pose, or the robot has no tool.
         InputError: ``off_line`` is not above 0.
     """
-    q0, T_end = _checked(arm, start, T_world_end, off_line)
-    tool = np.asarray(arm.robot.T_link_tcp, dtype=np.float64)  # type: ignore[attr-defined]
+    q0, T_end, tool = _checked(arm, start, T_world_end, off_line)
     T_start = arm.forward(q0[None])[0, -1] @ tool
     length, turn = T_end[:3, 3] - T_start[:3, 3], so3_log(T_start[:3, :3].T @ T_end[:3, :3])
     if arm.check(field, q0[None]).in_collision[0]:
@@ -180,7 +179,8 @@ def _path(arm: RobotSpheres, field: GaussianCollisionField | None, q: Array, eps
     return Path(q, cost, Certificate(True, eps, clearance, arm.margin, -1 if field is None else field.map_version))
 
 
-def _checked(arm: RobotSpheres, start: ArrayLike, end: ArrayLike, off_line: float) -> tuple[Array, Array]:
+def _checked(arm: RobotSpheres, start: ArrayLike, end: ArrayLike, off_line: float) -> tuple[Array, Array, Array]:
+    """Return start (J,), end (4, 4) and the pose (4, 4) of the tool on the last link, all finite."""
     if not off_line > 0.0:
         raise InputError(f"is {off_line}.", field="off_line", hint="give metres above 0")
     q = np.ascontiguousarray(start, dtype=np.float64)
@@ -192,4 +192,4 @@ def _checked(arm: RobotSpheres, start: ArrayLike, end: ArrayLike, off_line: floa
         raise GoalError("is no rigid pose.", field="T_world_end", hint="give (4, 4) with an orthonormal rotation")
     if not isinstance(arm.robot, HasTool):
         raise GoalError("is a pose.", field="T_world_end", hint=f"{arm.robot.name} has no tool")
-    return q, T
+    return q, T, np.asarray(arm.robot.T_link_tcp, dtype=np.float64)
