@@ -18,6 +18,7 @@ from tyro.conf import arg
 
 from splatbot.bench.results import Results
 from splatbot.bench.tables import Table
+from splatbot.errors import InputError
 
 ReportProgress = Callable[[str], None]
 
@@ -121,9 +122,7 @@ class Benchmark:
             InputError: A setting makes no sense, or there are no results to draw.
         """
         if settings.redraw:
-            results = Results.read_json(settings.folder / f"{settings.stem}.json")
-            self.plot(results, settings.folder)
-            return results
+            return self._redraw(settings.folder, settings.folder / f"{settings.stem}.json")
         settings.validate()
         if settings.quick:
             settings = replace(settings, **settings.quick_values)
@@ -142,6 +141,15 @@ class Benchmark:
         if settings.csv is not None:
             results.write_csv(settings.csv)
         self.plot(results, settings.folder)
+        return results
+
+    def _redraw(self, folder: Path, file: Path) -> Results:
+        results = Results.read_json(file)
+        try:
+            self.plot(results, folder)
+        except (LookupError, TypeError, ValueError) as error:
+            why = f"has not the results that this version plots ({type(error).__name__}: {error})."
+            raise InputError(why, file=file, hint="run the benchmark again") from error
         return results
 
 

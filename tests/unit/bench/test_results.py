@@ -54,6 +54,15 @@ def test_redraw_without_results_names_the_missing_file(tmp_path: Path, capsys: p
     assert "planning.json" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("name", ["training", "sizing"])
+def test_redraw_of_results_of_another_version_names_the_file(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Results(MACHINE, [Row("a b", "time", None, "ms")], {"x": [1]}).write_json(tmp_path / f"{name}.json")
+    assert main(["bench", name, "--redraw", "--out", str(tmp_path)]) == 2
+    assert f"{name}.json" in "".join(capsys.readouterr().err.split())
+
+
 @pytest.mark.parametrize("kept", [(), ("a.json",), ("results.txt",)])
 def test_ctrl_c_leaves_a_folder_only_if_it_has_results_or_was_there_before(
     tmp_path: Path, kept: tuple[str, ...]
