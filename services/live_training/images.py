@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from splatbot.camera import Camera
 from splatbot.geometry import inverse
-from splatbot.rasterize import rasterization
+from splatbot.rasterize.maps import render_map
 from splatbot.rasterize.native import one_torch_thread
 from splatbot.services.live_training.requests import MAX_WIDTH, LiveRequest
 from splatbot.training.images import ImageCache
@@ -58,28 +58,22 @@ def draw(session: TrainingSession, request: LiveRequest, width: int) -> LivePict
     viewmat = torch.from_numpy(_viewmat(session, request))
     model, background = session.trainer.model, session.options.shade
     with torch.no_grad(), one_torch_thread():
-        renders, alphas, _ = rasterization(
-            model.means,
-            model.quats,
-            model.scales,
-            model.opacities,
-            model.sh,
-            viewmat[None],
-            torch.from_numpy(camera.K_corner)[None],
+        render = render_map(
+            model,
+            viewmat,
+            torch.from_numpy(camera.K_corner),
             camera.width,
             camera.height,
-            sh_degree=model.sh_degree,
-            backgrounds=background[None],
+            background=background,
             render_mode="RGB+ED",
-            depth_mode="plane",
-            rasterize_mode="antialiased" if session.options.antialiased else "classic",
+            antialiased=session.options.antialiased,
         )
-        image = (255 * renders[0, ..., :3].clamp(0, 1)).round().to(torch.uint8).numpy()
+        image = (255 * render.image[..., :3].clamp(0, 1)).round().to(torch.uint8).numpy()
         third = (
             slice(camera.height // 3, -(-2 * camera.height // 3)),
             slice(camera.width // 3, -(-2 * camera.width // 3)),
         )
-        covered = renders[0, ..., 3][third][alphas[0, ..., 0][third] > _COVERED_ALPHA]
+        covered = render.image[..., 3][third][render.alpha[..., 0][third] > _COVERED_ALPHA]
         distance = float(covered.median()) if len(covered) else session.trainer.extent
     return LivePicture(image, inverse(viewmat.numpy()), distance)
 

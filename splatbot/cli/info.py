@@ -185,11 +185,12 @@ def describe_map(path: Path) -> list[tuple[str, str]]:
     import numpy as np
 
     from splatbot.gaussians import GaussianModel
+    from splatbot.gaussians.surfels import holds_surfels
     from splatbot.results.units import count, megabytes
 
     model = GaussianModel.load(path)
     rows = [
-        ("Gaussians", count(len(model))),
+        ("surfels" if holds_surfels(model) else "Gaussians", count(len(model))),
         ("SH degree", str(model.sh_degree)),
         ("file", megabytes(path.stat().st_size)),
         ("in memory", megabytes(model.nbytes)),

@@ -50,6 +50,7 @@ def train(
     refine_intrinsics: bool = False,
     exposure: bool = False,
     antialiased: bool = False,
+    surfels: bool = False,
     batch: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
     processes: Annotated[int, tyro.conf.arg(metavar="N")] = 1,
     blocks: Annotated[int, tyro.conf.arg(metavar="N")] = 1,
@@ -76,6 +77,7 @@ def train(
         splatbot train scenes/lego --iterations 20000 --out runs/lego
         splatbot train scenes/fox --strategy mcmc --max-gaussians 100000
         splatbot train scenes/phone --refine-poses --exposure
+        splatbot train scenes/statue --surfels
         splatbot train runs/desk --minutes 5
         splatbot train scenes/garden --processes 4
         splatbot train scenes/town --blocks 8 --processes 2
@@ -102,6 +104,8 @@ def train(
         exposure: compensate the exposure of each photograph by an affine colour transform, and write exposures.json.
             The colour-corrected PSNR does not depend on the exposures of held-out views.
         antialiased: compensate the low-pass filter in opacities, for views from other distances than the photographs'.
+        surfels: train flat discs (2D Gaussian splatting), whose surface is more accurate for a mesh
+            (docs/guide/surfels.md). The map of a run stays as it is.
         batch: photographs of each step; one for each process by default.
         processes: number of processes that train together; each takes its share of the photographs of a step. For
             several machines use torchrun (docs/guide/distributed.md).
@@ -158,6 +162,7 @@ def train(
             refine_intrinsics=refine_intrinsics,
             exposure=exposure,
             antialiased=antialiased,
+            surfels=surfels,
             seed=seed,
             batch=batch if batch is not None else group.size if blocks == 1 else 1,
         )

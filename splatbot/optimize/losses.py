@@ -18,10 +18,26 @@ WINDOW = 11  # [px] side of the window of SSIM
 
 def l1(rendered: Tensor, observed: Tensor, mask: Tensor | None = None) -> Tensor:
     """Return the mean absolute difference, over ``mask`` if given (broadcast over channels); 0 for an empty mask."""
-    difference = (rendered - observed).abs()
+    return masked_mean((rendered - observed).abs(), mask)
+
+
+def masked_mean(values: Tensor, mask: Tensor | None) -> Tensor:
+    """Return the mean of values, over ``mask`` if given (broadcast over channels); 0 for an empty mask."""
     if mask is None:
-        return difference.mean()
-    return (difference * mask).sum() / mask.expand_as(difference).sum().clamp_min(1)
+        return values.mean()
+    return (values * mask).sum() / mask.expand_as(values).sum().clamp_min(1)
+
+
+def normal_consistency(normals: Tensor, depth_normals: Tensor, alpha: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Return the mean 1 - nᵀ N α of surfels (Huang et al. 2024, Eq. 14, as in their program), over ``mask`` if given.
+
+    Args:
+        normals: n (H, W, 3), the surfels' normals, blended.
+        depth_normals: N (H, W, 3) of the rendered depth, unit vectors; 0 where unknown.
+        alpha: α (H, W, 1); receives no gradient.
+        mask: (H, W) bool.
+    """
+    return masked_mean(1 - (normals * depth_normals * alpha.detach()).sum(-1), mask)
 
 
 def relative_depth_error(rendered: Tensor, depth: Tensor, mask: Tensor) -> Tensor:

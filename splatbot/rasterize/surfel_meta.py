@@ -10,7 +10,7 @@ from torch import Tensor
 
 _PROJECTED = ("means2d", "depths", "normals", "radii", "tiles_per_gauss")
 _TILES = ("tile_size", "tile_width", "tile_height", "n_isects", "state_bytes")
-_PLAIN = ("width", "height", "n_cameras", "opacities", "visible_ids", "gradient_2dgs")
+_PLAIN = ("width", "height", "n_cameras", "opacities", "visible_ids", "visibility", "gradient_2dgs")
 
 
 class SurfelMeta(Mapping[str, Any]):
@@ -18,7 +18,7 @@ class SurfelMeta(Mapping[str, Any]):
 
     - means2d (C, N, 2) projected centres [px], depths (C, N) of the centres [m], radii (C, N, 2) int32 [px].
     - normals (C, N, 3) world frame, facing the camera; tiles_per_gauss (C, N). These are zero for surfels out of view.
-    - opacities (C, N). visible_ids: a list of C tensors of indices.
+    - opacities (C, N). visibility (C, N) bool: in view. visible_ids: a list of C tensors of indices.
     - tile_size (width, height) [px], tile_width and tile_height [tiles], n_isects and state_bytes: lists of C.
     - gradient_2dgs (C, N, 2): zeros that the render depends on; the others carry no gradients.
     """
@@ -43,6 +43,10 @@ class SurfelMeta(Mapping[str, Any]):
                 self._known[key] = self._opacities.expand(len(self._states), -1)
             elif key == "visible_ids":
                 self._known[key] = [torch.from_numpy(state.visible()) for state in self._states]
+            elif key == "visibility":
+                self._known[key] = torch.zeros(len(self._states), len(self._opacities), dtype=torch.bool)
+                for row, ids in zip(self._known[key], self["visible_ids"], strict=True):
+                    row[ids.long()] = True
             else:
                 raise KeyError(key)
         return self._known[key]

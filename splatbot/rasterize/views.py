@@ -15,7 +15,7 @@ from splatbot.camera import Camera
 from splatbot.errors import CameraError, InputError
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import inverse, quat_to_rotation, transform_points
-from splatbot.rasterize.rasterization import rasterization
+from splatbot.rasterize.maps import render_map
 
 Mode = Literal["rgb", "depth", "normal", "alpha"]
 MODES: tuple[Mode, ...] = ("rgb", "depth", "normal", "alpha")
@@ -198,21 +198,17 @@ def _splat(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Blend features (H, W, C), or the model's colours if None; return them with the opacity (H, W)."""
     with torch.no_grad():
-        images, alphas, _ = rasterization(
-            means=model.means,
-            quats=model.quats,
-            scales=model.scales,
-            opacities=model.opacities,
-            colors=model.sh if features is None else features.contiguous(),
-            sh_degree=(model.sh_degree if sh_degree is None else sh_degree) if features is None else None,
-            viewmats=torch.as_tensor(T_camera_world, dtype=torch.float64)[None],
-            Ks=torch.as_tensor(camera.K_corner, dtype=torch.float64)[None],
-            width=camera.width,
-            height=camera.height,
+        render = render_map(
+            model,
+            torch.as_tensor(T_camera_world, dtype=torch.float64),
+            torch.as_tensor(camera.K_corner, dtype=torch.float64),
+            camera.width,
+            camera.height,
+            features=features,
+            degree=sh_degree,
             render_mode=render_mode,
-            depth_mode="plane",  # blended centres of a slanted surface lie in front of it
         )
-    return images[0].numpy(), alphas[0, ..., 0].numpy()
+    return render.image.numpy(), render.alpha[..., 0].numpy()
 
 
 def _check_pinhole(camera: Camera) -> None:

@@ -81,7 +81,13 @@ class BlockTraining:
             assert options.max_gaussians is not None
             if not len(self.data.points):
                 check_memory(self.data.folder, self.train)  # random points need the images
-            start = initial_model(self.data, ImageCache(self.train), most=options.max_gaussians, seed=options.seed)
+            start = initial_model(
+                self.data,
+                ImageCache(self.train),
+                most=options.max_gaussians,
+                seed=options.seed,
+                surfels=options.surfels,
+            )
         blocks = cut_scene(start.means.double().numpy(), self.train, self.settings.blocks)
         if not resume:
             self.folder.begin(self.settings)

@@ -42,7 +42,9 @@ class InitialConstants:
 CONSTANTS = InitialConstants()
 
 
-def initial_model(data: TrainingData, images: ImageCache, *, most: int, seed: int) -> GaussianModel:
+def initial_model(
+    data: TrainingData, images: ImageCache, *, most: int, seed: int, surfels: bool = False
+) -> GaussianModel:
     """Return Gaussians at the points of a dataset, or at random points where it has none.
 
     Args:
@@ -50,6 +52,7 @@ def initial_model(data: TrainingData, images: ImageCache, *, most: int, seed: in
         images: of its training views.
         most: largest number of Gaussians; more points are thinned at random.
         seed: of the random draws.
+        surfels: return discs of random directions.
     """
     random = np.random.default_rng(seed)
     points, colors = data.points, data.point_colors.astype(np.float64) / 255
@@ -59,10 +62,14 @@ def initial_model(data: TrainingData, images: ImageCache, *, most: int, seed: in
     if len(points) > most:
         kept = np.sort(random.choice(len(points), most, replace=False))
         points, colors = points[kept], colors[kept]
+    quats = np.tile([1.0, 0.0, 0.0, 0.0], (len(points), 1))
+    scales = np.repeat(neighbour_distances(points)[:, None], 3, axis=1)
+    if surfels:
+        quats, scales = random.normal(size=quats.shape), scales * [1.0, 1.0, 0.0]
     return GaussianModel.from_activated(
         means=points,
-        quats=np.tile([1.0, 0.0, 0.0, 0.0], (len(points), 1)),
-        scales=np.repeat(neighbour_distances(points)[:, None], 3, axis=1),
+        quats=quats,
+        scales=scales,
         opacities=np.full(len(points), CONSTANTS.opacity),
         colors=colors,
     )

@@ -59,6 +59,9 @@ class TrainingOptions:
         refine_intrinsics: estimate fx, fy, cx and cy of each camera; its lens distortion is fixed.
         exposure: estimate an affine colour transform of the map for each photograph.
         antialiased: render with opacities that compensate the low-pass filter (Yu et al. 2024).
+        surfels: train discs, 2D Gaussian splatting (Huang et al. 2024).
+        normal_weight: of the normal consistency of surfels, in the later part of the run.
+        distortion_weight: of their distortion [share of the scene's extent]; see :mod:`splatbot.training.surface`.
         coarse_share: share of the run at half the resolution or less.
         seed: of all random draws.
         batch: images of each step; their mean loss is minimized.
@@ -79,6 +82,9 @@ class TrainingOptions:
     refine_intrinsics: bool = False
     exposure: bool = False
     antialiased: bool = False
+    surfels: bool = False
+    normal_weight: float = 0.05
+    distortion_weight: float = 0.01
     coarse_share: float = 0.3
     seed: int = 0
     batch: int = 1
@@ -95,6 +101,8 @@ class TrainingOptions:
             ("depth_weight", 0, 100),
             ("opacity_weight", 0, 100),
             ("scale_weight", 0, 100),
+            ("normal_weight", 0, 100),
+            ("distortion_weight", 0, 100),
             ("coarse_share", 0, 1),
             ("seed", 0, 2**31),
             ("batch", 1, 1024),
@@ -102,6 +110,12 @@ class TrainingOptions:
             value = getattr(self, name)
             if value is not None and not least <= value <= most:
                 raise InputError(f"is {value:g}.", field=name, hint=f"give {least:g} to {most:g}")
+        if self.surfels and self.strategy == "absgrad":
+            hint = "use the strategy default or mcmc"
+            raise InputError("have no absolute gradients, which absgrad needs.", field="surfels", hint=hint)
+        if self.surfels and self.antialiased:
+            hint = "leave antialiased or surfels out"
+            raise InputError("have a fixed low-pass filter, which antialiased replaces.", field="surfels", hint=hint)
 
     @property
     def regularizers(self) -> tuple[float, float]:
@@ -119,7 +133,7 @@ class TrainingOptions:
     def keeps_frame(self) -> bool:
         """Return whether the trained map keeps surfaces and world frame of the start, so that it can replace it."""
         refined = self.refine_poses or self.refine_intrinsics
-        return self.keep_surfaces and self.strategy == "fixed" and not refined
+        return self.keep_surfaces and self.strategy == "fixed" and not refined and not self.surfels
 
     def capped(self, pixels: int) -> TrainingOptions:
         """Return the options with ``max_gaussians`` for training views of ``pixels`` pixels in all."""
@@ -134,5 +148,7 @@ class TrainingOptions:
         cap = self.max_gaussians or _MOST_GAUSSIANS
         if self.strategy == "mcmc":
             return MCMCStrategy(cap_max=cap)
+        if self.surfels:  # values of gsplat's trainer of surfels
+            return DefaultStrategy(cap_max=cap, prune_opa=0.05, key_for_gradient="gradient_2dgs")
         absgrad = self.strategy == "absgrad"
         return DefaultStrategy(cap_max=cap, absgrad=absgrad, grow_grad2d=0.0008 if absgrad else 0.0002)

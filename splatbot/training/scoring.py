@@ -20,7 +20,7 @@ from splatbot.training.exposures import exposed, fitted_exposure
 from splatbot.training.images import ImageCache, Photo
 from splatbot.training.options import TrainingOptions
 from splatbot.training.poses import CameraPoses
-from splatbot.training.trainer import render_photo
+from splatbot.training.rendering import render_photo
 
 _ALIGN_STEPS = 60
 _ALIGN_RATES = 3e-3, 1e-4  # [rad] at the first and the last step
@@ -86,10 +86,10 @@ def score_held_out(
         if options.refine_poses:
             _align(model, photo, poses, index, background, options)
         with torch.no_grad():
-            render, alpha, _ = render_photo(
+            seen = render_photo(
                 model, photo, poses.viewmats[index], background, model.sh_degree, antialiased=options.antialiased
             )
-        image, colors = photo.over(background), render[..., :3]
+        image, colors, alpha = photo.over(background), seen.image[..., :3], seen.alpha
         counted = torch.ones(image.shape[:2], dtype=torch.bool) if photo.trained is None else photo.trained
         corrected = None
         if not psnr_only:
@@ -146,8 +146,8 @@ def _align(
     """Move the pose of a view to where the map looks most like the photograph."""
     for step in range(_ALIGN_STEPS):
         viewmat = poses.viewmats[index].clone().requires_grad_()
-        render, _, _ = render_photo(model, photo, viewmat, background, model.sh_degree, antialiased=options.antialiased)
-        loss = l1_dssim(render[..., :3].contiguous(), photo.over(background), options.dssim_weight, photo.trained)
+        render = render_photo(model, photo, viewmat, background, model.sh_degree, antialiased=options.antialiased)
+        loss = l1_dssim(render.image[..., :3].contiguous(), photo.over(background), options.dssim_weight, photo.trained)
         (gradient,) = torch.autograd.grad(loss, [viewmat])
         first, last = _ALIGN_RATES
         poses.step(index, gradient, first * (last / first) ** (step / _ALIGN_STEPS))

@@ -115,8 +115,9 @@ class TrainingSession:
         elif not group.leads:
             start = GaussianModel.empty()  # until that of the first process arrives
         elif start is None:
-            assert self.options.max_gaussians is not None
-            start = initial_model(data, self.images, most=self.options.max_gaussians, seed=self.options.seed)
+            o = self.options
+            assert o.max_gaussians is not None
+            start = initial_model(data, self.images, most=o.max_gaussians, seed=o.seed, surfels=o.surfels)
         self.trainer = Trainer(start, self.images, self.options, data.scene_extent, group)
         self.seconds = 0.0
         self.rows: list[ProgressRow] = []

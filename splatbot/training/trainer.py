@@ -14,13 +14,13 @@ from torch import Tensor
 from splatbot.config import MappingConfig
 from splatbot.gaussians import GaussianModel
 from splatbot.gaussians.shape import shortest_axes
+from splatbot.gaussians.surfels import as_surfels, flatten
 from splatbot.optimize.adam import PARAMETERS, GaussianAdam
 from splatbot.optimize.losses import l1_dssim, relative_depth_error
 from splatbot.optimize.strategies import StrategyStep
 from splatbot.optimize.strategies.edits import grow_harmonics
 from splatbot.optimize.surfaces import limit_normal_motion, limit_shape
-from splatbot.rasterize import rasterization
-from splatbot.rasterize.meta import RenderMeta
+from splatbot.rasterize.maps import MapRender
 from splatbot.rasterize.native import one_torch_thread
 from splatbot.training.distributed import ALONE, TrainingGroup
 from splatbot.training.exposures import ExposureTransforms, exposed
@@ -28,6 +28,8 @@ from splatbot.training.images import ImageCache, Photo
 from splatbot.training.intrinsics import CameraIntrinsics, matrix, prior
 from splatbot.training.options import TrainingOptions
 from splatbot.training.poses import CameraPoses
+from splatbot.training.rendering import render_photo
+from splatbot.training.surface import SurfaceWeights, surface_loss
 
 _MAPPING = MappingConfig()
 _OF_VIEWS = {
@@ -96,7 +98,8 @@ class BatchGradients:
         views, ids = self.seen[: len(self.centers)].nonzero(as_tuple=True)
         rows = self.centers[views, ids]
         centers = SimpleNamespace(grad=rows, absgrad=rows)
-        return {"means2d": centers, "gaussian_ids": ids, "width": 2, "height": 2, "n_cameras": 1}
+        names = dict.fromkeys(("means2d", "gradient_2dgs"), centers)
+        return {**names, "gaussian_ids": ids, "width": 2, "height": 2, "n_cameras": 1}
 
 
 class Trainer:
@@ -119,7 +122,8 @@ class Trainer:
         group: TrainingGroup = ALONE,
     ) -> None:
         bands = (options.sh_degree + 1) ** 2
-        self.model = replace(model.clone(), sh=model.sh[:, :bands].clone())
+        start = as_surfels(model) if options.surfels else model
+        self.model = replace(start.clone(), sh=start.sh[:, :bands].clone())
         self.images = images
         self.options = options
         self.extent = extent
@@ -186,7 +190,8 @@ class Trainer:
         degree = max(self.model.sh_degree, min(self.options.sh_degree, scheduled))
         self.model = grow_harmonics(self.model, self.adam, degree)
         self._set_rates(progress)
-        batch = self._gradients(views, reduce, degree)
+        weights = SurfaceWeights.at(self.options, progress, self.extent)
+        batch = self._gradients(views, reduce, degree, weights)
         indices = [index for index, _ in views]
         if batch.poses is not None:
             for index, gradient in zip(indices, batch.poses, strict=True):
@@ -201,9 +206,13 @@ class Trainer:
             self.adam.step(self.model, batch.grads, seen.any(0))
         done = StrategyStep(self.iteration, progress, batch.meta(), self.adam, self._random)
         self.model = self.strategy.step_post_backward(self.model, self._growth, done)
+        if self.options.surfels:
+            flatten(self.model)
         return float(batch.loss)
 
-    def _gradients(self, views: list[tuple[int, Tensor]], reduce: int, degree: int) -> BatchGradients:
+    def _gradients(
+        self, views: list[tuple[int, Tensor]], reduce: int, degree: int, weights: SurfaceWeights
+    ) -> BatchGradients:
         """Compute the gradients of the mean loss over views and their backgrounds, each process those of its share."""
         n, count = len(self.model), len(views)
         parameters = {name: getattr(self.model, name).requires_grad_(True) for name in PARAMETERS}
@@ -216,28 +225,32 @@ class Trainer:
         for row in self.group.share(count):
             index, background = views[row]
             photo = self.images.photo(index, reduce)
-            render, alpha, meta = render_photo(
+            render = render_photo(
                 self.model,
                 photo,
                 viewmats[row],
                 background,
                 degree,
                 K=None if changes is None else matrix(self.images.views[index].camera, changes[row], photo.camera),
+                depth=weights.normal > 0,
+                surfels=self.options.surfels,
                 antialiased=self.options.antialiased,
                 absgrad=self.strategy.absgrad,
+                distortion=weights.distortion > 0,
             )
             transform = None if transforms is None else transforms[row]
-            own = self._loss(render, alpha, photo, background, transform)
+            own = self._loss(render, photo, background, transform)
+            if self.options.surfels:
+                own = own + surface_loss(render, weights, photo.trained)
             if changes is not None:
                 own = own + prior(changes[row]).float()
-            self.strategy.step_pre_backward(self._growth, meta)
+            self.strategy.step_pre_backward(self._growth, render.meta)
             own.backward()
             loss += own.detach()
-            seen[row] = meta["visibility"][0]
+            seen[row] = render.meta["visibility"][0]
             if self._growth:
-                gradient = meta["means2d"].absgrad if self.strategy.absgrad else meta["means2d"].grad
                 half = torch.tensor([photo.camera.width, photo.camera.height]) / 2
-                centers[row].index_copy_(0, meta["gaussian_ids"], gradient * half)
+                centers[row] = render.center_gradients(absolute=self.strategy.absgrad) * half
         grads = {name: parameter.grad.contiguous() for name, parameter in parameters.items()}
         for parameter in parameters.values():
             parameter.requires_grad_(False)
@@ -283,7 +296,7 @@ class Trainer:
         self.adam.rates = {
             "means": _between(c.means_rate, progress) * self.extent,
             "quats": c.quats_rate,
-            "log_scales": c.scales_rate,
+            "log_scales": [c.scales_rate, c.scales_rate, 0.0] if self.options.surfels else c.scales_rate,
             "opacity_logits": c.opacities_rate,
             "sh": [c.dc_rate] * 3 + rest,
         }
@@ -293,24 +306,22 @@ class Trainer:
             return torch.rand(3, generator=self._random)
         return self.options.shade
 
-    def _loss(
-        self, render: Tensor, alpha: Tensor, photo: Photo, background: Tensor, transform: Tensor | None
-    ) -> Tensor:
+    def _loss(self, render: MapRender, photo: Photo, background: Tensor, transform: Tensor | None) -> Tensor:
         """Compute L = (1 - λ) L1 + λ (1 - SSIM) + w_d mean |(D - D*) / D*|, over the pixels that are trained on.
 
         With a transform (3, 4), the colours are those of the photograph's exposure.
         """
-        colors = render[..., :3]
+        colors = render.image[..., :3]
         if transform is not None:
-            colors = exposed(colors, alpha, background, transform)
+            colors = exposed(colors, render.alpha, background, transform)
         loss = l1_dssim(colors.contiguous(), photo.over(background), self.options.dssim_weight, photo.trained)
         if photo.depth is None or self.options.depth_weight == 0:
             return loss
         depth = photo.depth[..., None]
-        measured = (depth > 0) & (alpha.detach() > CONSTANTS.covered_alpha)
+        measured = (depth > 0) & (render.alpha.detach() > CONSTANTS.covered_alpha)
         if photo.trained is not None:
             measured &= photo.trained[..., None]
-        return loss + self.options.depth_weight * relative_depth_error(render[..., 3:], depth, measured)
+        return loss + self.options.depth_weight * relative_depth_error(render.image[..., 3:], depth, measured)
 
     def _add_regularizers(self, grads: dict[str, Tensor]) -> None:
         """Add the gradients of w_o · mean o + w_s · mean σ."""
@@ -321,49 +332,6 @@ class Trainer:
             grads["opacity_logits"] += opacity / n * o * (1 - o)
         if scale > 0:
             grads["log_scales"] += scale / (3 * n) * self.model.scales
-
-
-def render_photo(
-    model: GaussianModel,
-    photo: Photo,
-    viewmat: Tensor,
-    background: Tensor,
-    degree: int,
-    *,
-    K: Tensor | None = None,
-    antialiased: bool = False,
-    absgrad: bool = False,
-) -> tuple[Tensor, Tensor, RenderMeta]:
-    """Render the view of a photograph: colours (H, W, 3), with depth (H, W, 4) if it has depth, and alpha (H, W, 1).
-
-    Args:
-        model: the map.
-        photo: gives the camera, and whether depth is wanted.
-        viewmat: (4, 4) T_camera_world.
-        background: (3,) seen where the map is transparent.
-        degree: of the harmonics in use.
-        K: (3, 3) intrinsics with pixel centres at +0.5; None for those of the photograph.
-        antialiased: whether opacities compensate the low-pass filter.
-        absgrad: whether the absolute gradients of the projected centres are needed.
-    """
-    renders, alphas, meta = rasterization(
-        model.means,
-        model.quats,
-        model.log_scales.exp(),
-        torch.sigmoid(model.opacity_logits),
-        model.sh,
-        viewmat[None],
-        (torch.from_numpy(photo.camera.K_corner) if K is None else K)[None],
-        photo.camera.width,
-        photo.camera.height,
-        sh_degree=degree,
-        backgrounds=background[None],
-        render_mode="RGB" if photo.depth is None else "RGB+ED",
-        depth_mode="center" if photo.depth is None else "plane",
-        rasterize_mode="antialiased" if antialiased else "classic",
-        absgrad=absgrad,
-    )
-    return renders[0], alphas[0], meta
 
 
 def _reduction(progress: float, coarse_share: float) -> int:

@@ -10,7 +10,6 @@ import torch
 
 from splatbot.gaussians import GaussianModel
 from splatbot.optimize.adam import GaussianAdam
-from splatbot.rasterize.meta import RenderMeta
 
 
 @dataclass(frozen=True)
@@ -20,7 +19,7 @@ class StrategyStep:
     Args:
         number: of the iteration, from 0.
         progress: share of the run that is done, 0 to 1.
-        meta: of the render, or of all renders of the step, see :class:`RenderMeta`.
+        meta: of the render, or of all renders of the step, see :class:`splatbot.rasterize.meta.RenderMeta`.
         adam: the optimizer; its moments follow the Gaussians, and its rate of the means scales the noise of MCMC.
         random: generator of the random draws.
     """
@@ -46,7 +45,7 @@ class Strategy:
         """Return the state before the first step: tensors and numbers by name."""
         return {}
 
-    def step_pre_backward(self, state: dict[str, Any], meta: RenderMeta) -> None:
+    def step_pre_backward(self, state: dict[str, Any], meta: Mapping[str, Any]) -> None:
         """Prepare the render of a step for :meth:`step_post_backward`, before the backward pass."""
 
     def step_post_backward(self, model: GaussianModel, state: dict[str, Any], step: StrategyStep) -> GaussianModel:

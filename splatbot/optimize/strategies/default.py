@@ -12,7 +12,6 @@ from torch import Tensor
 from splatbot.gaussians import GaussianModel
 from splatbot.optimize.strategies.base import Strategy, StrategyStep
 from splatbot.optimize.strategies.edits import duplicate, remove, reset_opacities, split
-from splatbot.rasterize.meta import RenderMeta
 
 
 @dataclass(frozen=True)
@@ -31,6 +30,7 @@ class DefaultStrategy(Strategy):
         reset_every: iterations between two resets of the opacities to twice ``prune_opa``.
         refine_every: iterations between two changes.
         pause_refine_after_reset: iterations without changes after a reset.
+        key_for_gradient: name of the projected centres in meta: "gradient_2dgs" for surfels.
         absgrad: sum absolute gradients over pixels (Ye et al. 2024); ``grow_grad2d`` is then some 0.0008.
         revised_opacity: opacities of halves by Bulò et al. 2024.
         cap_max: largest number of Gaussians; the largest gradients have priority near it.
@@ -45,6 +45,7 @@ class DefaultStrategy(Strategy):
     reset_every: int = 3000
     refine_every: int = 100
     pause_refine_after_reset: int = 0
+    key_for_gradient: str = "means2d"
     absgrad: bool = False
     revised_opacity: bool = False
     cap_max: int = 1_000_000
@@ -54,9 +55,9 @@ class DefaultStrategy(Strategy):
         n = len(model)
         return {"grad2d": torch.zeros(n), "count": torch.zeros(n), "scene_scale": scene_scale}
 
-    def step_pre_backward(self, state: dict[str, Any], meta: RenderMeta) -> None:
+    def step_pre_backward(self, state: dict[str, Any], meta: Mapping[str, Any]) -> None:
         """Keep the gradient of the projected centres."""
-        meta["means2d"].retain_grad()
+        meta[self.key_for_gradient].retain_grad()
 
     @torch.no_grad()
     def step_post_backward(self, model: GaussianModel, state: dict[str, Any], step: StrategyStep) -> GaussianModel:
@@ -75,7 +76,7 @@ class DefaultStrategy(Strategy):
 
     def _count(self, state: dict[str, Any], meta: Mapping[str, Any]) -> None:
         """Add the norms of the centres' gradients in an image of width and height 2."""
-        centers = meta["means2d"]
+        centers = meta[self.key_for_gradient]
         gradient = centers.absgrad if self.absgrad else centers.grad
         half = torch.tensor([meta["width"], meta["height"]]) / 2 * meta["n_cameras"]
         ids = meta["gaussian_ids"]

@@ -16,8 +16,9 @@ from splatbot.training.datasets import TrainingData, TrainingView
 from splatbot.training.images import ImageCache
 from splatbot.training.initialize import initial_model
 from splatbot.training.options import TrainingOptions
+from splatbot.training.rendering import render_photo
 from splatbot.training.scoring import score_held_out, summary
-from splatbot.training.trainer import Trainer, render_photo
+from splatbot.training.trainer import Trainer
 from tests.unit.training.rendered import rendered_data
 
 pytestmark = pytest.mark.usefixtures("default_kernels")
@@ -56,10 +57,10 @@ def test_depth_draws_the_surface_to_the_measured_one() -> None:
         trainer, _ = trained(200, data=rendered_data(points=300, depth=True), depth_weight=weight)
         photo = trainer.images.photo(0)
         with torch.no_grad():
-            render, alpha, _ = render_photo(trainer.model, photo, trainer.poses.viewmats[0], torch.zeros(3), 3)
+            render = render_photo(trainer.model, photo, trainer.poses.viewmats[0], torch.zeros(3), 3)
         assert photo.depth is not None
-        seen = (photo.depth > 0) & (alpha[..., 0] > 0.5)
-        errors[weight] = float((render[..., 3] - photo.depth)[seen].abs().mean())
+        seen = (photo.depth > 0) & (render.alpha[..., 0] > 0.5)
+        errors[weight] = float((render.image[..., 3] - photo.depth)[seen].abs().mean())
     assert errors[0.5] < 0.8 * errors[0.0]
 
 
