@@ -18,7 +18,7 @@ from splatbot.formats.octomap import save_octomap
 from splatbot.gaussians import GaussianModel
 from splatbot.geometry import transform_points
 from splatbot.logs import open_log
-from splatbot.rasterize.views import render_view
+from splatbot.rasterize.meshes import MeshMethod, map_mesh
 from splatbot.results.folder import RunFolder
 from splatbot.results.views import subsampled_views
 from splatbot.segmentation.objects import solid_rows
@@ -95,15 +95,13 @@ class MapExport:
         cloud.colors = o3d.utility.Vector3dVector(self.model.colors.double().numpy()[rows])
         return lambda path: _written(o3d.io.write_point_cloud(path, cloud), path)
 
-    def mesh(self) -> Writer:
-        """Export the surface of the map's depth, rendered along the camera path and fused (marching cubes).
+    def mesh(self, method: MeshMethod | None = None) -> Writer:
+        """Export the surface that the map shows along the camera path, see :func:`splatbot.rasterize.meshes.map_mesh`.
 
         Raises:
-            InputError: the camera path is not known.
+            InputError: the camera path is not known, it shows no surface, or the method does not fit the map.
         """
         import open3d as o3d
-
-        from splatbot.evaluation.depth_fusion import DepthFusion
 
         path = self.file.with_name("trajectory.tum")
         if not path.is_file():
@@ -112,17 +110,12 @@ class MapExport:
         width, height = CONSTANTS.mesh_size
         f = CONSTANTS.mesh_focal * width
         camera = Camera(f, f, (width - 1) / 2, (height - 1) / 2, width, height)
-        fusion = DepthFusion(self.voxel / 4, 5.0)
-        for T_world_camera in poses[:: max(1, -(-len(poses) // CONSTANTS.mesh_views))]:
-            depth = render_view(self.model, camera, T_world_camera, "depth")
-            fusion.add(np.asarray(depth, dtype=np.float32), camera, T_world_camera)
+        views = [(camera, T) for T in poses[:: max(1, -(-len(poses) // CONSTANTS.mesh_views))]]
         try:
-            mesh = fusion.mesh()
-        except RuntimeError as error:  # of Open3D, for an empty surface
-            hint = "map more frames of it, or give a larger --voxel"
-            raise InputError(
-                "has no surface that three views share.", file=self.file, field="mesh", hint=hint
-            ) from error
+            mesh = map_mesh(self.model, views, self.voxel / 4, method)
+        except InputError as error:
+            error.file = str(self.file)
+            raise
         return lambda place: _written(o3d.io.write_triangle_mesh(place, mesh), place)
 
     def esdf(self) -> Writer:

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from splatbot.map_export import MapExport
+    from splatbot.rasterize.meshes import MeshMethod
 
 Format = Literal["mesh", "points", "esdf", "octomap", "grid"]
 
@@ -49,6 +50,7 @@ def export(
     formats: Annotated[tuple[Format, ...], tyro.conf.arg(name="format", metavar="NAME ...")] = (),
     voxel: Annotated[float, tyro.conf.arg(metavar="METRES")] = CONSTANTS.voxel,
     n_sigma: float = 2.0,
+    mesh_from: Literal["auto", "depth", "median", "poisson"] = "auto",
 ) -> int:
     """Write a map in the formats of other programs.
 
@@ -64,6 +66,7 @@ def export(
         splatbot export runs/desk
         splatbot export runs/desk --format mesh --voxel 0.01 --out meshes
         splatbot export map.ply --format points esdf
+        splatbot export runs/statue-trained --format mesh --mesh-from poisson
 
     Args:
         map: a run folder, or a map file.
@@ -71,6 +74,9 @@ def export(
         formats: formats to write; by default all that the map allows.
         voxel: edge length of voxels; the mesh uses a quarter of it.
         n_sigma: surface of a Gaussian, in standard deviations, for distances and occupancy.
+        mesh_from: depth fuses the expected depth of views (TSDF), median the depth at which half of the light is left,
+            which surfels alone have. Poisson solves for the surface through rendered points and normals. Auto selects
+            median for surfels and depth otherwise.
     """
     file = map_file(map)
     folder = out if out is not None else file.with_name("export")
@@ -86,7 +92,7 @@ def export(
     writers: dict[str, Callable[[Path], None]] = {}
     for name in formats or tuple(_FILES):
         try:
-            writers |= _writers(exported, name)
+            writers |= _writers(exported, name, None if mesh_from == "auto" else mesh_from)
         except InputError as error:
             if formats:
                 raise
@@ -99,9 +105,9 @@ def export(
     return 0
 
 
-def _writers(exported: MapExport, name: Format) -> dict[str, Callable[[Path], None]]:
+def _writers(exported: MapExport, name: Format, mesh_from: MeshMethod | None) -> dict[str, Callable[[Path], None]]:
     if name == "mesh":
-        return {"mesh.ply": exported.mesh()}
+        return {"mesh.ply": exported.mesh(mesh_from)}
     if name == "points":
         return {"points.ply": exported.points()}
     if name == "esdf":

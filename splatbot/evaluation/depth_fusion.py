@@ -50,7 +50,9 @@ class DepthFusion:
         """Integrate one z-depth image (H, W) [m]; missing depth is 0 or not finite."""
         import open3d as o3d
 
-        known = np.isfinite(depth) & (depth < self._farthest)
+        known = np.isfinite(depth) & (depth > 0) & (depth < self._farthest)
+        if not known.any():  # Open3D takes it for an error
+            return
         image = o3d.t.geometry.Image(o3d.core.Tensor.from_numpy(np.where(known, depth, 0).astype(np.float32)))
         K, T_camera_world = (o3d.core.Tensor.from_numpy(m) for m in (camera.K, inverse(T_world_camera)))
         blocks = self._grid.compute_unique_block_coordinates(image, K, T_camera_world, 1.0, self._farthest)
