@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,10 +17,14 @@ class Camera:
     """Pinhole camera; axes as OpenCV (x right, y down, z forward).
 
     A point (x, y, z) [m] of the camera frame projects to u = fx·x/z + cx, v = fy·y/z + cy. Integer (u, v) is the
-    centre of a pixel. ``distortion`` are OpenCV's (k1, k2, p1, p2[, k3[, k4, k5, k6]]), empty when undistorted.
+    centre of a pixel. ``distortion`` are OpenCV's (k1, k2, p1, p2[, k3[, k4, k5, k6[, s1, s2, s3, s4[, τx, τy]]]]);
+    empty when undistorted.
+
+    With ``fisheye`` they are k1 to k4 of the equidistant model (Kannala and Brandt 2006). A ray at the angle θ to the
+    axis is then at f·(θ + k1·θ³ + k2·θ⁵ + k3·θ⁷ + k4·θ⁹) from the principal point.
 
     Raises:
-        CameraError: an intrinsic is not finite or not positive, or the number of coefficients is unknown.
+        CameraError: an intrinsic is not finite or not positive, or the coefficients are not finite or too few or many.
     """
 
     fx: float
@@ -30,6 +34,7 @@ class Camera:
     width: int
     height: int
     distortion: tuple[float, ...] = ()
+    fisheye: bool = False
 
     def __post_init__(self) -> None:
         for name in ("fx", "fy", "cx", "cy"):
@@ -38,10 +43,11 @@ class Camera:
         for name in ("fx", "fy", "width", "height"):
             if getattr(self, name) <= 0:
                 raise CameraError(f"is {getattr(self, name)}, must be positive.", field=name, hint="check the unit: px")
-        if len(self.distortion) not in (0, 4, 5, 8):
-            raise CameraError(
-                f"has {len(self.distortion)} coefficients.", field="distortion", hint="OpenCV's 4, 5 or 8, or none"
-            )
+        if len(self.distortion) not in ((4,) if self.fisheye else (0, 4, 5, 8, 12, 14)):
+            hint = "give 4: k1 to k4 of the fisheye" if self.fisheye else "OpenCV's 4, 5, 8, 12 or 14, or none"
+            raise CameraError(f"has {len(self.distortion)} coefficients.", field="distortion", hint=hint)
+        if not np.isfinite(self.distortion).all():
+            raise CameraError("has values that are not finite.", field="distortion", hint="calibrate the camera again")
 
     def check_plausible(self) -> None:
         """Check that the intrinsics can be those of a recorded image.
@@ -66,6 +72,11 @@ class Camera:
                 )
 
     @property
+    def pinhole(self) -> Camera:
+        """Return the undistorted camera with the same intrinsic matrix and size."""
+        return replace(self, distortion=(), fisheye=False)
+
+    @property
     def K(self) -> NDArray[np.float64]:
         """Intrinsic matrix (3, 3) for pixel centres at integers (OpenCV's convention)."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
@@ -80,14 +91,14 @@ class Camera:
     def resized(self, width: int, height: int) -> Camera:
         """Return the same camera with images of another size [px]; the scaling maps pixel areas, not pixel centres."""
         sx, sy = width / self.width, height / self.height
-        return Camera(
+        return replace(
+            self,
             fx=self.fx * sx,
             fy=self.fy * sy,
             cx=(self.cx + 0.5) * sx - 0.5,
             cy=(self.cy + 0.5) * sy - 0.5,
             width=width,
             height=height,
-            distortion=self.distortion,
         )
 
     def project(self, points_camera: ArrayLike) -> NDArray[np.float64]:

@@ -150,7 +150,6 @@ class FramePairs:
         if topic in (INFO, DEPTH_INFO):
             camera = camera_of(message)
             self._check_size(camera.width, camera.height)
-            camera.check_plausible()
             if topic == INFO:
                 self._cameras.color = camera
             else:

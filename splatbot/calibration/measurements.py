@@ -150,9 +150,12 @@ class PoseMeasurement:
 
 def board_pose(view: BoardView, camera: Camera) -> Array:
     """Compute T_camera_board (4, 4) of one view (PnP, refined by Levenberg-Marquardt)."""
-    distortion = np.array(camera.distortion) if camera.distortion else None
-    _, r, t = cv2.solvePnP(view.points, view.pixels, camera.K, distortion, flags=cv2.SOLVEPNP_IPPE)
-    r, t = cv2.solvePnPRefineLM(view.points, view.pixels, camera.K, distortion, r, t)
+    pixels, lens = view.pixels, np.array(camera.distortion)
+    if camera.fisheye:
+        straight = cv2.fisheye.undistortPoints(pixels.reshape(-1, 1, 2), camera.K, lens, P=camera.K)
+        pixels, lens = np.asarray(straight, np.float64), np.zeros(0)
+    _, r, t = cv2.solvePnP(view.points, pixels, camera.K, lens, flags=cv2.SOLVEPNP_IPPE)
+    r, t = cv2.solvePnPRefineLM(view.points, pixels, camera.K, lens, r, t)
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = so3_exp(r.reshape(3)), t.reshape(3)
     return T
@@ -160,8 +163,7 @@ def board_pose(view: BoardView, camera: Camera) -> Array:
 
 def project(points: Array, T_camera_board: Array, camera: Camera) -> Array:
     """Project points (N, 3) [m] of the board into the image: (N, 2) [px]."""
-    distortion = np.array(camera.distortion) if camera.distortion else None
-    pixels = cv2.projectPoints(
-        points, so3_log(T_camera_board[:3, :3]), T_camera_board[:3, 3].copy(), camera.K, distortion
-    )[0]
+    project_points = cv2.fisheye.projectPoints if camera.fisheye else cv2.projectPoints
+    r, t = so3_log(T_camera_board[:3, :3]), T_camera_board[:3, 3].copy()
+    pixels = project_points(points.reshape(-1, 1, 3), r, t, camera.K, np.array(camera.distortion))[0]
     return np.asarray(pixels, np.float64).reshape(-1, 2)

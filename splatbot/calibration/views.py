@@ -160,7 +160,7 @@ def _open_raw(source: str) -> Log:
     recorded = log.calibration
     if not recorded.camera.distortion:
         return log
-    return open_log(source, camera=replace(recorded, camera=replace(recorded.camera, distortion=())))
+    return open_log(source, camera=replace(recorded, camera=recorded.camera.pinhole))
 
 
 def _beside(image: Path) -> ArmView:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -272,7 +271,7 @@ def _views(map_: Path, indices: tuple[int, ...]) -> list[ObservedView]:
             frame = mapped[index]
             depth = np.where(frame.valid, frame.depth, np.float32(0))
         seen = log[index]
-        views.append(ObservedView(replace(seen.camera, distortion=()), poses[index], seen.rgb, depth))
+        views.append(ObservedView(seen.camera.pinhole, poses[index], seen.rgb, depth))
     return views
 
 

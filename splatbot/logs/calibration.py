@@ -47,7 +47,8 @@ class Calibration:
 def read_calibration(path: str | Path) -> Calibration:
     """Read `intrinsics.json`: fx, fy, cx, cy [px], width, height [px], depth_scale [units/m], optional distortion.
 
-    The optional object "sensor" holds values of the section `sensor` of the configuration. Other keys are ignored.
+    With the optional `"fisheye": true`, the distortion is k1 to k4 of the equidistant model. The optional object
+    "sensor" holds values of the section `sensor` of the configuration. Other keys are ignored.
 
     Raises:
         CameraError: the file is missing or not a JSON object, or a value is missing or invalid.
@@ -56,10 +57,12 @@ def read_calibration(path: str | Path) -> Calibration:
     distortion = values.get("distortion", [])
     if not isinstance(distortion, list):
         raise CameraError("is no list.", file=path, field="distortion", hint="OpenCV's [k1, k2, p1, p2, k3]")
+    fisheye = values.get("fisheye", False)
+    if not isinstance(fisheye, bool):
+        raise CameraError(f"is {fisheye!r:.40}.", file=path, field="fisheye", hint="write true or false")
     named = {str(i): value for i, value in enumerate(distortion)}
-    calibration = make_calibration(
-        path, values, scale_key="depth_scale", distortion=tuple(number(path, named, key) for key in named)
-    )
+    lens = tuple(number(path, named, key) for key in named)
+    calibration = make_calibration(path, values, scale_key="depth_scale", distortion=lens, fisheye=fisheye)
     sensor = values.get("sensor", {})
     if not isinstance(sensor, dict):
         raise CameraError("is no JSON object.", file=path, field="sensor", hint='write {"readout": 0.03, ...}')
@@ -77,6 +80,8 @@ def save_calibration(calibration: Calibration, path: str | Path) -> None:
     values["depth_scale"] = calibration.depth_scale
     if c.distortion:
         values["distortion"] = list(c.distortion)
+    if c.fisheye:
+        values["fisheye"] = True
     values["sensor"] = dict(calibration.sensor)
     with atomic_write(Path(path)) as file:
         file.write(json.dumps(values, indent=1, allow_nan=False).encode() + b"\n")
@@ -89,6 +94,7 @@ def make_calibration(
     scale_key: str,
     size_keys: tuple[str, str] = ("width", "height"),
     distortion: tuple[float, ...] = (),
+    fisheye: bool = False,
 ) -> Calibration:
     """Build a calibration from the ``values`` of the file ``path``.
 
@@ -98,7 +104,7 @@ def make_calibration(
     fx, fy, cx, cy, scale = (number(path, values, key) for key in ("fx", "fy", "cx", "cy", scale_key))
     width, height = (round(number(path, values, key)) for key in size_keys)
     try:
-        camera = Camera(fx, fy, cx, cy, width, height, distortion)
+        camera = Camera(fx, fy, cx, cy, width, height, distortion, fisheye)
     except CameraError as error:
         raise CameraError(error.message, file=path, field=error.field, hint=error.hint) from error
     return Calibration(camera, scale, str(path))

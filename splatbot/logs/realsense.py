@@ -58,10 +58,7 @@ class RealSenseLog(StampedLog):
             for stream, camera in ((self._color, color), (self._depth, depth))
             if camera.distortion
         }
-        color, self.camera = (
-            self._lenses[stream].camera if stream in self._lenses else camera
-            for stream, camera in ((self._color, color), (self._depth, depth))
-        )
+        color, self.camera = color.pinhole, depth.pinhole
         T_color_depth = self._rigid(self._color) @ inverse(self._rigid(self._depth))
         try:
             self._registration = ColorRegistration(color, self.camera, T_color_depth)
@@ -117,12 +114,10 @@ class RealSenseLog(StampedLog):
         if info.distortion_model in _MODELS:
             info.distortion_model = "plumb_bob"  # OpenCV's five coefficients
         try:
-            camera = camera_of(info)
-            camera.check_plausible()
+            return camera_of(info)
         except CameraError as error:
             field = f"{stream} {error.field}"
             raise CameraError(error.message, file=self.path, field=field, hint=error.hint) from error
-        return camera
 
     def _rigid(self, stream: str) -> Array:
         T = self._file.extrinsics(stream)

@@ -7,10 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from splatbot.camera import Camera
-from splatbot.errors import CameraError, LogError
-
-_MAX_SIDE = 16_384  # [px] of an image; OpenCV cannot resample sides above 32767
-_MAX_PIXELS = 2**24
+from splatbot.errors import LogError
+from splatbot.logs.undistort import check_size
 
 
 class ColorRegistration:
@@ -25,21 +23,29 @@ class ColorRegistration:
         color: undistorted colour camera.
         depth: undistorted depth camera.
         T_color_depth: (4, 4), points of the depth camera to those of the colour camera.
+        unseen: pixels (H, W) of the undistorted colour image that its lens does not show. Depth there is dropped.
 
     Raises:
         CameraError: an image is too large.
     """
 
-    def __init__(self, color: Camera, depth: Camera, T_color_depth: ArrayLike | None = None) -> None:
+    def __init__(
+        self,
+        color: Camera,
+        depth: Camera,
+        T_color_depth: ArrayLike | None = None,
+        *,
+        unseen: NDArray[np.bool_] | None = None,
+    ) -> None:
         for camera in (color, depth):
-            if max(camera.width, camera.height) > _MAX_SIDE or camera.width * camera.height > _MAX_PIXELS:
-                raise CameraError(
-                    f"is {camera.width}x{camera.height}.", field="image size", hint="give images of up to 16 megapixels"
-                )
+            check_size(camera)
         T = np.eye(4) if T_color_depth is None else np.asarray(T_color_depth, np.float64)
         self.color_size, self.depth_size = (color.width, color.height), (depth.width, depth.height)
         share = min(1.0, depth.fx / color.fx)
         self._reduced = color.resized(*(max(1, round(share * side)) for side in self.color_size))
+        self._unseen = None
+        if unseen is not None and unseen.any():
+            self._unseen = self._resized(unseen.astype(np.uint8) * 255) > 0
         x = (np.arange(depth.width) - depth.cx) / depth.fx
         y = (np.arange(depth.height) - depth.cy) / depth.fy
         rays = np.stack([*np.meshgrid(x, y), np.ones((depth.height, depth.width))])
@@ -77,8 +83,13 @@ class ColorRegistration:
         width, height = self._reduced.width, self._reduced.height
         u, v = (np.clip(np.where(ahead, a / z, -1.0), -1.0, n) for a, n in ((x, width), (y, height)))
         seen = (u >= -0.5) & (u <= width - 0.5) & (v >= -0.5) & (v <= height - 0.5)
-        reduced = cv2.resize(rgb, (width, height), interpolation=cv2.INTER_AREA)
-        color = cv2.remap(
-            reduced, u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-        )
+        if self._unseen is not None:
+            seen &= ~self._unseen[np.rint(v).astype(int).clip(0, height - 1), np.rint(u).astype(int).clip(0, width - 1)]
+        at = u.astype(np.float32), v.astype(np.float32)
+        color = cv2.remap(self._resized(rgb), *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(color, dtype=np.uint8), np.where(seen, depth, np.float32(0))
+
+    def _resized(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Reduce an image of the colour camera to the resolution of the depth camera."""
+        size = (self._reduced.width, self._reduced.height)
+        return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)

@@ -50,7 +50,7 @@ class RgbdReader:
         self.calibration = calibration
         self._empty_depth = empty_depth
         self._undistort = Undistorter(calibration.camera) if calibration.camera.distortion else None
-        self.camera: Camera = self._undistort.camera if self._undistort else calibration.camera
+        self.camera: Camera = calibration.camera.pinhole
 
     def read(self, index: int, stamp: float, color: Path, depth: Path, mask: NDArray[np.bool_] | None = None) -> Frame:
         """Read a frame from two files; ``mask`` (H, W) refers to the distorted image.

@@ -20,6 +20,8 @@ FindTransform = Callable[[str, str], Array | None]
 class CameraPair:
     """Removes the distortion of colour and depth, and puts colour of another camera at the pixels of depth.
 
+    The undistorted images have the intrinsic matrices of the recorded ones. They show the middle part of a fisheye image.
+
     Args:
         color: colour camera.
         depth: depth camera. If it equals the colour camera at the same place, images stay at their pixels.
@@ -36,11 +38,15 @@ class CameraPair:
     def __init__(self, color: Camera, depth: Camera, T_color_depth: ArrayLike) -> None:
         self.color, self.depth, self.T_color_depth = color, depth, np.asarray(T_color_depth, np.float64)
         self._lens_of_color = Undistorter(color) if color.distortion else None
-        self._lens_of_depth = Undistorter(depth) if depth.distortion else None
-        straight = self._lens_of_color.camera if self._lens_of_color else color
-        self.camera = self._lens_of_depth.camera if self._lens_of_depth else depth
+        self._lens_of_depth = self._lens_of_color
+        if color != depth:
+            self._lens_of_depth = Undistorter(depth) if depth.distortion else None
+        self.camera = depth.pinhole
         self.one = color == depth and np.array_equal(self.T_color_depth, np.eye(4))
-        self._registration = None if self.one else ColorRegistration(straight, self.camera, self.T_color_depth)
+        unseen = self._lens_of_color.unseen if self._lens_of_color else None
+        self._registration = (
+            None if self.one else ColorRegistration(color.pinhole, self.camera, self.T_color_depth, unseen=unseen)
+        )
 
     def images(
         self, rgb: NDArray[np.uint8], depth: NDArray[np.float32]
@@ -60,6 +66,10 @@ class CameraPair:
         if self._lens_of_depth is not None:
             depth = self._lens_of_depth.depth(depth)
         return (rgb, depth) if self._registration is None else self._registration.register(rgb, depth, "frame")
+
+    def mask(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Return a mask (H, W) of the recorded images of one camera at the pixels of ``camera``."""
+        return mask if self._lens_of_color is None else self._lens_of_color.mask(mask)
 
 
 class RosCameras:

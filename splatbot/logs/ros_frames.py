@@ -16,9 +16,12 @@ from splatbot.frame import Frame
 from splatbot.geometry import pose_from_quat, rotation_to_quat
 from splatbot.logs.image_size import image_size
 from splatbot.logs.ros_types import Message, build
+from splatbot.logs.undistort import check_lens
 
 COLOR_ENCODINGS = ("rgb8", "bgr8", "rgba8", "bgra8")
 DEPTH_ENCODINGS = ("16UC1", "mono16", "32FC1")
+_RADIAL = ("plumb_bob", "rational_polynomial")  # OpenCV's 4 to 14 coefficients
+_FISHEYES = ("equidistant", "fisheye")  # OpenCV's cv2.fisheye: Kannala-Brandt
 _MILLIMETRES = 1000.0  # of 16UC1 and mono16 (REP 118)
 _COMPRESSED_DEPTH_HEADER = 12  # bytes before the PNG: format and two quantisation parameters, used by 32FC1 alone
 _NANO = 10**9
@@ -150,17 +153,34 @@ def camera_info_message(stamp: float, camera: Camera, frame_id: str = "camera") 
 def camera_of(message: Message) -> Camera:
     """Convert a sensor_msgs/CameraInfo of ROS 1 or 2 to a camera with its distortion.
 
+    Coefficients that are all 0 are no distortion. A fisheye (`equidistant` or `fisheye`) needs others, because drivers
+    write them for rectified images as well as for an ideal equidistant lens.
+
     Raises:
-        CameraError: a value makes no sense, or the distortion is of another model.
+        CameraError: a value makes no sense, or the distortion is of another model. A lens sees 180 degrees or more.
     """
     k, d = (np.asarray(getattr(message, a, getattr(message, a.upper(), None)), np.float64) for a in ("k", "d"))
+    if not k.any():
+        raise CameraError("is all 0.", field="K", hint="calibrate the camera, or give --camera FILE")
     model = message.distortion_model or "plumb_bob"
-    if model not in ("plumb_bob", "rational_polynomial") and d.any():
-        hint = "undistort the images, or use plumb_bob or rational_polynomial"
-        raise CameraError(f"is {model!r}.", field="distortion_model", hint=hint)
-    distortion = tuple(d.tolist()) if d.any() else ()
-    fx, fy, cx, cy = k[[0, 4, 2, 5]].tolist()
-    return Camera(fx, fy, cx, cy, int(message.width), int(message.height), distortion)
+    fisheye = model in _FISHEYES
+    if fisheye and not d.any():
+        hint = "name plumb_bob if the images are rectified; give --camera FILE with fisheye: true for an ideal lens"
+        raise CameraError(f"has no coefficients other than 0 of {model!r}.", field="D", hint=hint)
+    if model not in (*_FISHEYES, *_RADIAL) and d.any():
+        hint = f"undistort the images, or use {', '.join((*_RADIAL, *_FISHEYES))}"
+        raise CameraError(f"is {model!r:.40}.", field="distortion_model", hint=hint)
+    try:
+        distortion = tuple(d.tolist()) if d.any() else ()
+        fx, fy, cx, cy = k[[0, 4, 2, 5]].tolist()
+        camera = Camera(fx, fy, cx, cy, int(message.width), int(message.height), distortion, fisheye)
+        camera.check_plausible()
+        check_lens(camera)
+    except CameraError as error:
+        if error.field != "distortion":
+            raise
+        raise CameraError(f"{error.message.rstrip('.')} ({model}).", field="D", hint=error.hint) from error
+    return camera
 
 
 def joint_state_message(stamp: float, positions: ArrayLike, names: tuple[str, ...] = ()) -> Message:

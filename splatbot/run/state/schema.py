@@ -105,7 +105,7 @@ TYPES: Mapping[str, SavedType] = {
     "frame_result": _dataclass(FrameResult, "camera_name", "anchor"),
     "graph_location": _dataclass(GraphLocation),
     "joint_motion": SavedType(JointMotionMonitor, _fields("still_speed", "_last")),
-    "camera": _dataclass(Camera),
+    "camera": _dataclass(Camera, "fisheye"),
     "gaussians": _dataclass(GaussianModel),
     "keyframe": _dataclass(Keyframe, "is_poor", "camera_name"),
     "mapper": SavedType(

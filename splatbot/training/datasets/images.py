@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from splatbot.camera import Camera
 from splatbot.errors import CameraError, FormatError, LogError
+from splatbot.logs import undistort
 from splatbot.logs.image_size import image_size
 from splatbot.logs.images import read_color
 from splatbot.training.datasets.base import TrainingView
@@ -27,7 +28,6 @@ Pixels = NDArray[np.integer[Any] | np.floating[Any]]  # as OpenCV's functions ta
 _PERSPECTIVE = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # OpenCV's order
 _FISHEYE = ("k1", "k2", "k3", "k4")
 _PNG_WITH_ALPHA = (3, 4, 6)  # colour types: palette (perhaps), grey and RGB
-_RADII = 4096  # samples between the axis and the corner of an image
 
 
 @dataclass(frozen=True)
@@ -36,16 +36,14 @@ class Lens:
 
     Args:
         camera: intrinsics with distortion.
-        fisheye: whether the distortion is (k1, k2, k3, k4) of OpenCV's equidistant fisheye model.
     """
 
     camera: Camera
-    fisheye: bool = False
 
     @property
     def pinhole(self) -> Camera:
         """The camera of the undistorted images: the same intrinsic matrix and size."""
-        return replace(self.camera, distortion=())
+        return self.camera.pinhole
 
     @property
     def distorts(self) -> bool:
@@ -54,7 +52,7 @@ class Lens:
 
     def resized(self, size: tuple[int, int]) -> Lens:
         """Return the same lens with images of another width and height [px]."""
-        return Lens(self.camera.resized(*size), self.fisheye)
+        return Lens(self.camera.resized(*size))
 
 
 def make_lens(
@@ -80,11 +78,11 @@ def make_lens(
     if not fisheye:
         distortion = _shortened(distortion)
     try:
-        camera = Camera(values["fx"], values["fy"], values["cx"] - 0.5, values["cy"] - 0.5, *size, distortion)
+        camera = Camera(values["fx"], values["fy"], values["cx"] - 0.5, values["cy"] - 0.5, *size, distortion, fisheye)
         camera.check_plausible()
     except CameraError as error:
         raise FormatError(error.message, file=file, field=f"{field} {error.field}", hint=error.hint) from error
-    return Lens(camera, fisheye)
+    return Lens(camera)
 
 
 @dataclass(frozen=True)
@@ -206,43 +204,14 @@ def scaled_mask(mask: NDArray[np.bool_], size: tuple[int, int]) -> NDArray[np.bo
 
 @lru_cache(maxsize=1)
 def unseen(lens: Lens) -> NDArray[np.bool_]:
-    """Return the pixels (H, W) of the pinhole camera that a recorded image does not show.
-
-    The source of these pixels is outside of the image, or their ray is beyond the radius up to which the distorted
-    radius grows. There the model maps a second ray to a pixel that shows another one.
-    """
-    u, v = _source_pixels(lens)
-    width, height, camera = lens.camera.width, lens.camera.height, lens.pinhole
-    inside = (u >= -0.5) & (u <= width - 0.5) & (v >= -0.5) & (v <= height - 0.5)
-    x, y = (np.arange(width) - camera.cx) / camera.fx, (np.arange(height) - camera.cy) / camera.fy
-    radius = np.hypot(x[None, :], y[:, None])
-    return np.asarray(~inside | (radius > _valid_radius(lens, float(radius.max()))))
+    """Return the pixels (H, W) of the pinhole camera that a recorded image does not show."""
+    return undistort.unseen(lens.camera, _source_pixels(lens))
 
 
 @lru_cache(maxsize=1)
 def _source_pixels(lens: Lens) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return the pixels (H, W) u and v of the recorded image for those of the pinhole camera."""
-    camera, coefficients = lens.camera, np.array(lens.camera.distortion)
-    undistort = cv2.fisheye.initUndistortRectifyMap if lens.fisheye else cv2.initUndistortRectifyMap
-    u, v = undistort(camera.K, coefficients, np.eye(3), camera.K, (camera.width, camera.height), cv2.CV_32FC1)
-    return np.asarray(u, np.float32), np.asarray(v, np.float32)
-
-
-def _valid_radius(lens: Lens, largest: float) -> float:
-    """Return the radius, in focal lengths, up to which the distorted radius grows; at most ``largest``."""
-    radii = np.linspace(0.0, largest, _RADII)
-    with np.errstate(all="ignore"):
-        grows = np.diff(_distorted_radius(lens, radii)) > 0  # False for NaN
-    return largest if grows.all() else float(radii[np.argmin(grows)])
-
-
-def _distorted_radius(lens: Lens, r: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Distort radii (N,) in focal lengths; tangential terms are left out."""
-    if lens.fisheye:
-        theta = np.arctan(r)
-        return np.asarray(theta * np.polyval([*lens.camera.distortion[::-1], 1.0], theta**2))
-    k1, k2, _, _, k3, k4, k5, k6 = (*lens.camera.distortion, *[0.0] * (8 - len(lens.camera.distortion)))
-    return np.asarray(r * np.polyval([k3, k2, k1, 1.0], r**2) / np.polyval([k6, k5, k4, 1.0], r**2))
+    return undistort.source_pixels(lens.camera)
 
 
 def resample(image: Image, resampler: Callable[[Pixels], Pixels]) -> Image:
