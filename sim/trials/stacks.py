@@ -198,7 +198,9 @@ def decide(known: StackMap, hint: Hint, *, looks: bool = False) -> StackDecision
 def choose(
     known: StackMap, trial: TrialScene, scan: TrialScan, *, looks: bool = False
 ) -> tuple[TrialScene, StackDecision]:
-    """Return the trial with the candidate whose best grasp has the highest confidence, and its grasps.
+    """Return the trial with the candidate that has the best grasp, and its grasps.
+
+    Grasps with a certified lift are better than all others. In a pile, an object under others has grasps without one.
 
     Raises:
         AffordanceError: there is no object at any hint.
@@ -213,10 +215,15 @@ def choose(
     if not found:
         assert refused is not None
         raise refused
-    name, best = max(found, key=lambda one: max((g.confidence for g in one[1].grasps.grasps), default=-1.0))
+    name, best = max(found, key=lambda one: max(map(_rank, one[1].grasps.grasps), default=(False, -1.0)))
     seconds = sum(decision.seconds for _, decision in found)
     kinds = {trial.target: trial.kind, **trial.others}
     return replace(trial, target=name, kind=kinds[name]), replace(best, seconds=seconds)
+
+
+def _rank(grasp: Grasp) -> tuple[bool, float]:
+    """Return whether a grasp can be lifted as far as is known, and its confidence 0..1."""
+    return not grasp.lift_blocked, grasp.confidence
 
 
 class _CachedPlanner:
