@@ -125,8 +125,7 @@ def arm_stops(stage: Stage, _: MotionOptions) -> Path:
 
     def pose(t: float) -> Array:
         segment, since = divmod(t, _MOVE_S + _REST_S)
-        s = min(since / _MOVE_S, 1.0)
-        fraction = s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
+        fraction = _minimum_jerk(since / _MOVE_S)
         a, b = _STOPS[int(segment) % len(_STOPS)], _STOPS[(int(segment) + 1) % len(_STOPS)]
         at = a + fraction * (b - a)
         return _moved(stage.home, at[:3], np.radians(at[3:]))
@@ -182,6 +181,33 @@ def turns(stage: Stage, _: MotionOptions) -> Path:
         return _moved(stage.home, sway, angles)
 
     return pose
+
+
+_SNAP_DEG, _SNAP_S, _SNAP_PERIOD_S = 25.0, 0.2, 1.0
+
+
+def snaps(stage: Stage, motion: MotionOptions) -> Path:
+    """Turn by 25° within 0.2 s and back, once a second at a random time about a random axis: up to 234 °/s.
+
+    A turn has minimum jerk. The camera sways by 2 cm and rests otherwise between turns, so that its velocity does not
+    predict the next turn: the angular acceleration reaches 63 rad/s².
+    """
+
+    def pose(t: float) -> Array:
+        number, since = divmod(t, _SNAP_PERIOD_S)
+        rng = np.random.default_rng([motion.seed, 2, max(int(number), 0)])
+        axis, begin = rng.normal(size=3), rng.uniform(0.1, 0.3)
+        away, back = (_minimum_jerk((since - at) / _SNAP_S) for at in (begin, begin + 0.35))
+        sway = [0.02 * np.sin(2.1 * t), 0.02 * np.sin(1.7 * t + 0.5) - 0.01, 0.02 * np.sin(1.3 * t)]
+        return _moved(stage.home, sway, np.radians(_SNAP_DEG) * (away - back) * axis / np.linalg.norm(axis))
+
+    return pose
+
+
+def _minimum_jerk(s: float) -> float:
+    """Return the fraction of a motion by minimum jerk at the normalized time ``s``; 0 before it and 1 after it."""
+    s = min(max(s, 0.0), 1.0)
+    return s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
 
 
 def forward(stage: Stage, _: MotionOptions) -> Path:
@@ -241,7 +267,8 @@ def _circuit(stage: Stage, angle: float) -> Array:
 
 
 TRAJECTORIES: dict[str, Callable[[Stage, MotionOptions], Path]] = {
-    path.__name__: path for path in (orbit, arm, arm_stops, handheld, rotation, turns, forward, steps, loop, laps)
+    path.__name__: path
+    for path in (orbit, arm, arm_stops, handheld, rotation, turns, snaps, forward, steps, loop, laps)
 }
 
 

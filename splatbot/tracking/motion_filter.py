@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from splatbot.geometry import adjoint, inverse, se3_exp, se3_log
+from splatbot.geometry import adjoint, inverse, se3_exp, se3_log, so3_log
 from splatbot.tracking.align import Alignment
+from splatbot.tracking.gyroscope import MeasuredTurn
 
 Array = NDArray[np.float64]
 
@@ -74,13 +75,30 @@ class CameraMotion:
                 [0                  1]          [dt²/2 S     dt S]
             P ← F P Fᵀ + Q
         """
-        p, dt = CONSTANTS, stamp - self.stamp
+        dt = stamp - self.stamp
         F = np.eye(12)
         F[:6, :6], F[:6, 6:] = adjoint(se3_exp(-dt * self.twist)), dt * np.eye(6)
-        density = p.correlation * np.repeat([p.acceleration**2, p.angular_acceleration**2], 3)
-        Q = np.kron([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]], np.diag(density))
         T = self.T_world_camera @ se3_exp(dt * self.twist)
-        return CameraMotion(stamp, T, self.twist, F @ self.covariance @ F.T + Q)
+        return CameraMotion(stamp, T, self.twist, F @ self.covariance @ F.T + _process_noise(dt))
+
+    def predict_turn(self, stamp: float, turn: MeasuredTurn) -> CameraMotion:
+        """Return the state at a later time [s], whose rotation is that of a gyroscope and not of the velocity.
+
+        The rotation φ and the angular rate ω of the gyroscope are inputs. Their errors (e_φ, e_ω) replace the angular
+        rows of F and Q, since the angular velocity so far has no influence::
+
+            T ← T exp((dt v, φ))
+            ξ ← Ad(exp(-(dt v, φ))) ξ + (dt η_v + q_ξ, e_φ)
+            η ← (η_v + q_η, e_ω)
+        """
+        dt = stamp - self.stamp
+        motion = np.concatenate([dt * self.twist[:3], so3_log(turn.R_last_camera)])
+        F, Q = np.zeros((12, 12)), _process_noise(dt)
+        F[:6, :6], F[:3, 6:9], F[6:9, 6:9] = adjoint(se3_exp(-motion)), dt * np.eye(3), np.eye(3)
+        angular = np.r_[3:6, 9:12]
+        Q[np.ix_(angular, angular)] = turn.covariance
+        twist = np.concatenate([self.twist[:3], turn.rate])
+        return CameraMotion(stamp, self.T_world_camera @ se3_exp(motion), twist, F @ self.covariance @ F.T + Q)
 
     def measure(self, alignment: Alignment, covariance: Array, used: Array, readout: float) -> CameraMotion:
         """Return the state after the alignment of a frame, which measures the pose and, by its rows, the velocity.
@@ -133,10 +151,15 @@ class MotionFilter:
     def __init__(self) -> None:
         self._state: CameraMotion | None = None
 
-    def predict(self, stamp: float) -> CameraMotion | None:
-        """Return the state at a time [s]; None at the start and over more than ``CONSTANTS.max_gap``."""
+    def predict(self, stamp: float, turn: MeasuredTurn | None = None) -> CameraMotion | None:
+        """Return the state at a time [s]; None at the start and over more than ``CONSTANTS.max_gap``.
+
+        A gyroscope predicts the rotation, unless it is doubted.
+        """
         if self._state is None or not 0 < stamp - self._state.stamp <= CONSTANTS.max_gap:
             return None
+        if turn is not None and not turn.is_doubted:
+            return self._state.predict_turn(stamp, turn)
         return self._state.predict(stamp)
 
     def twist_at(self, stamp: float) -> Array:
@@ -157,6 +180,13 @@ class MotionFilter:
     def forget(self) -> None:
         """Discard the motion, after a lost frame."""
         self._state = None
+
+
+def _process_noise(dt: float) -> Array:
+    """Return the covariance (12, 12) that white noise of acceleration adds to pose and velocity in a time [s]."""
+    p = CONSTANTS
+    density = p.correlation * np.repeat([p.acceleration**2, p.angular_acceleration**2], 3)
+    return np.asarray(np.kron([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]], np.diag(density)), np.float64)
 
 
 def mean_twist(T_first_second: Array, seconds: float) -> Array:

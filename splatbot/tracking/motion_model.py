@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatbot.frame import PosePrior
-from splatbot.geometry import adjoint, inverse, se3_exp, se3_log
+from splatbot.geometry import adjoint, inverse, se3_exp, se3_log, so3_log
+from splatbot.tracking.gyroscope import MeasuredTurn
 
 Array = NDArray[np.float64]
 
@@ -44,11 +45,13 @@ class Prediction:
         T_world_camera: (4, 4).
         covariance: (6, 6) of the twist (t [m], ω [rad]) in the camera's frame.
         absolute: True if the pose is known in the world. If False, it is relative to the previous frame.
+        turn: rotation since the last pose by a gyroscope, which a motion prior contains unless it is doubted.
     """
 
     T_world_camera: Array
     covariance: Array
     absolute: bool = False
+    turn: MeasuredTurn | None = None
 
 
 class ConstantVelocity:
@@ -67,6 +70,11 @@ class ConstantVelocity:
     def T_world_camera(self) -> Array:
         """Last known pose (4, 4)."""
         return self._last[1] if self._last is not None else np.eye(4)
+
+    @property
+    def stamp(self) -> float | None:
+        """Time [s] of the last known pose; None at the start."""
+        return None if self._last is None else self._last[0]
 
     def predict(self, stamp: float) -> Array:
         """Return the expected T_world_camera (4, 4) at a time [s]."""
@@ -95,16 +103,25 @@ class ConstantVelocity:
         sigma = 0.5 * dt**2 * np.array(3 * [CONSTANTS.acceleration] + 3 * [CONSTANTS.angular_acceleration])
         return np.diag(sigma**2)
 
-    def motion_prior(self, stamp: float, last_covariance: Array) -> Prediction:
-        """Predict the pose at a time [s] with its covariance; ``last_covariance`` (6, 6) is that of the last pose."""
+    def motion_prior(self, stamp: float, last_covariance: Array, turn: MeasuredTurn | None = None) -> Prediction:
+        """Predict the pose at a time [s] with its covariance.
+
+        Args:
+            stamp: the time.
+            last_covariance: (6, 6) of the last pose.
+            turn: rotation since the last pose by a gyroscope. It replaces that of the model unless it is doubted.
+        """
         motion = self._motion(stamp)
         dt = max(stamp - self._last[0], 0.0) if self._last is not None else 0.0
         p = CONSTANTS
         shift = p.rest + 0.5 * float(np.linalg.norm(motion[:3])) + 0.5 * p.acceleration * dt**2
-        turn = min(p.rest + 0.5 * float(np.linalg.norm(motion[3:])) + 0.5 * p.angular_acceleration * dt**2, np.pi)
-        process_noise = np.diag([shift**2] * 3 + [turn**2] * 3)
+        turn_sigma = min(p.rest + 0.5 * float(np.linalg.norm(motion[3:])) + 0.5 * p.angular_acceleration * dt**2, np.pi)
+        process_noise = np.diag([shift**2] * 3 + [turn_sigma**2] * 3)
+        if turn is not None and not turn.is_doubted:
+            motion = np.concatenate([motion[:3], so3_log(turn.R_last_camera)])
+            process_noise[3:, 3:] = turn.covariance[:3, :3] + p.rest**2 * np.eye(3)
         T = self.T_world_camera @ se3_exp(motion)
-        return Prediction(T, _transported(last_covariance, motion) + process_noise)
+        return Prediction(T, _transported(last_covariance, motion) + process_noise, turn=turn)
 
     def robot_prior(self, prior: PosePrior, last_covariance: Array) -> Prediction:
         """Return the pose that the robot reports; relative motions of lost frames accumulate until one is tracked."""

@@ -15,6 +15,7 @@ from splatbot.geometry import se3_exp
 from splatbot.tracking.budget import CostModel
 from splatbot.tracking.estimate import PoseEstimate
 from splatbot.tracking.features import Features, detect
+from splatbot.tracking.gyroscope import Gyroscope, MeasuredTurn
 from splatbot.tracking.hypothesis import ScoredHypothesis
 from splatbot.tracking.motion_filter import CameraMotion, MotionFilter
 from splatbot.tracking.motion_model import ConstantVelocity, Prediction
@@ -50,6 +51,7 @@ class Tracker:
         self.config = config
         self.motion = ConstantVelocity()
         self._filter = MotionFilter()
+        self._gyroscope = Gyroscope()
         self._lost = False
         self._keyframe_uncertainty: WeakKeyDictionary[Features, Uncertainty] = WeakKeyDictionary()
         self.variance_scale = 1.0
@@ -85,11 +87,15 @@ class Tracker:
         problem = TrackingProblem(self.config, prepared, keyframes, self._lost, T_last, search)
         scheduler = StageScheduler(problem, self._stages, self._costs)
         best = scheduler.best_hypothesis(robot_prior or motion_prior)
-        best, trusted_prior = self._check_robot_prior(best, robot_prior, motion_prior, problem, scheduler)
-        best = self._rectify_again(best, problem, scheduler)
+        best, trusted_prior, motion_prior = self._check_priors(best, robot_prior, motion_prior, problem, scheduler)
+        best = self._weigh_gyroscope(
+            self._rectify_again(best, motion_prior.turn, problem, scheduler), motion_prior.turn
+        )
         pose, uncertainty = self._fuse_prior(best, trusted_prior, motion_prior)
         pose = self._confirm_relocalization(frame.stamp, pose)
-        pose, uncertainty = self._filter_motion(pose, uncertainty, best, problem.prepared, trusted_prior)
+        pose, uncertainty = self._filter_motion(
+            pose, uncertainty, best, problem.prepared, trusted_prior, motion_prior.turn
+        )
         self._update(frame.stamp, pose, robot_prior)
         return PoseEstimate.create(pose, uncertainty, problem, scheduler.budget, self.motion.velocity)
 
@@ -151,44 +157,88 @@ class Tracker:
         return find
 
     def _predict(self, frame: Frame) -> tuple[Prediction, Prediction | None]:
-        """Return the motion prior, and the robot prior if the frame has one."""
-        motion_prior = self.motion.motion_prior(frame.stamp, self._last_covariance)
+        """Return the motion prior, and the robot prior if the frame has one, which replaces the gyroscope."""
+        turn = self._gyroscope.measure(frame.imu, self.motion.stamp, frame.stamp) if frame.prior is None else None
+        motion_prior = self.motion.motion_prior(frame.stamp, self._last_covariance, turn)
         if self._candidate is not None:
             motion_prior = replace(motion_prior, T_world_camera=self._candidate.T_world_camera)
         if frame.prior is None:
             return motion_prior, None
         return motion_prior, self.motion.robot_prior(frame.prior, self._last_covariance)
 
-    def _check_robot_prior(
+    def _check_priors(
         self,
         best: ScoredHypothesis,
         robot_prior: Prediction | None,
         motion_prior: Prediction,
         problem: TrackingProblem,
         scheduler: StageScheduler,
+    ) -> tuple[ScoredHypothesis, Prediction | None, Prediction]:
+        """Return the pose, and the robot prior and the motion prior without those that contradict the frame."""
+        if robot_prior is not None:
+            return *self._check_robot_prior(best, robot_prior, motion_prior, problem, scheduler), motion_prior
+        turn = motion_prior.turn
+        if turn is None or self._lost:
+            return best, None, motion_prior
+        plain = self.motion.motion_prior(problem.prepared.frame.stamp, self._last_covariance)
+        if not turn.is_doubted and not self._has_turned(best, turn):
+            best = _better(scheduler.best_hypothesis(plain), best)
+        if best.verdict == "lost" or turn.trust != "new" or self._has_turned(best, turn):
+            return best, None, motion_prior
+        return best, None, replace(plain, turn=replace(turn, trust="doubted"))
+
+    def _tracked_turn(self, pose: ScoredHypothesis) -> tuple[Array, Array]:
+        """Return the rotation (3, 3) from the last pose to a pose, and its covariance (3, 3) [rad²]."""
+        R = self.motion.T_world_camera[:3, :3].T @ pose.T_world_camera[:3, :3]
+        return R, self.variance_scale * (pose.covariance[3:, 3:] + R.T @ self._last_covariance[3:, 3:] @ R)
+
+    def _weigh_gyroscope(self, pose: ScoredHypothesis, turn: MeasuredTurn | None) -> ScoredHypothesis:
+        """Compare a pose with the gyroscope; a pose that contradicts it states this, and is doubted if that is proven.
+
+        The covariance of a doubted pose grows by d² / 3, where 3 is the expectation of χ² with 3 degrees of freedom.
+        The filter then corrects the rotation, and the translation by its correlation: on a wall, a wrong rotation is
+        paired with a wrong translation.
+        """
+        if turn is None or self._lost or pose.verdict == "lost" or pose.weak is not None:
+            return pose
+        self._gyroscope.observe(turn, *self._tracked_turn(pose))
+        if self._has_turned(pose, turn):
+            return pose
+        if turn.trust != "proven":
+            return pose.with_reasons("the gyroscope contradicts the rotation: left out")
+        scale = turn.distance(*self._tracked_turn(pose)) / 3
+        return replace(pose.degraded("the rotation contradicts the gyroscope"), covariance=scale * pose.covariance)
+
+    def _has_turned(self, pose: ScoredHypothesis, turn: MeasuredTurn) -> bool:
+        """Return whether a pose has the rotation of the gyroscope, or does not determine its rotation."""
+        return pose.verdict != "lost" and (pose.weak is not None or turn.agrees(*self._tracked_turn(pose)))
+
+    def _check_robot_prior(
+        self,
+        best: ScoredHypothesis,
+        robot_prior: Prediction,
+        motion_prior: Prediction,
+        problem: TrackingProblem,
+        scheduler: StageScheduler,
     ) -> tuple[ScoredHypothesis, Prediction | None]:
         """Reject a robot prior that contradicts the frame, and search again from the motion prior without it."""
-        if robot_prior is None:
-            return best, None
         view = problem.calibrated_view(self.motion.velocity)
         covariance = self._uncertainty(best).covariance(view) if robot_prior.absolute else best.covariance
         distance = mahalanobis_distance(best, robot_prior, covariance) if best.verdict != "lost" else np.inf
         if is_consistent(distance):
             return best, robot_prior
-        again = scheduler.best_hypothesis(motion_prior)
-        if (again.verdict == "lost", again.health.score) <= (best.verdict == "lost", best.health.score):
-            best = again
+        best = _better(scheduler.best_hypothesis(motion_prior), best)
         if best.verdict != "lost":
             amount = "far" if not np.isfinite(distance) else f"{distance:.0f} σ"
             best = best.with_reasons(f"the prior is {amount} off: left out")
         return best, None
 
     def _rectify_again(
-        self, best: ScoredHypothesis, problem: TrackingProblem, scheduler: StageScheduler
+        self, best: ScoredHypothesis, turn: MeasuredTurn | None, problem: TrackingProblem, scheduler: StageScheduler
     ) -> ScoredHypothesis:
         """Align the frame again, rectified by the velocity that its pose implies, until its rows stay in place."""
         sensor = self.config.sensor
-        predicted = self._predicted(problem.prepared.frame.stamp, best)
+        predicted = self._predicted(problem.prepared.frame.stamp, best, turn)
         lowest = best.health.score
         for _ in range(_MAX_RECTIFICATIONS):
             prepared = problem.prepared
@@ -226,6 +276,7 @@ class Tracker:
         best: ScoredHypothesis,
         prepared: PreparedFrame,
         robot_prior: Prediction | None,
+        turn: MeasuredTurn | None = None,
     ) -> tuple[ScoredHypothesis, Uncertainty]:
         """Weigh the pose against the motion so far; a robot prior knows the motion better and keeps the pose.
 
@@ -241,7 +292,7 @@ class Tracker:
             self._filter.update(CameraMotion.at_pose(stamp, pose.T_world_camera, covariance))
             return pose, uncertainty
         measured = pose if robot_prior is not None else best
-        state = self._measured(self._predicted(stamp, measured), measured, prepared)
+        state = self._measured(self._predicted(stamp, measured, turn), measured, prepared)
         self._filter.update(state)
         if robot_prior is not None:
             return pose, uncertainty
@@ -249,9 +300,9 @@ class Tracker:
         pose = pose.with_pose(state.T_world_camera, against_keyframes)
         return pose, self._uncertainty(pose)
 
-    def _predicted(self, stamp: float, pose: ScoredHypothesis) -> CameraMotion:
+    def _predicted(self, stamp: float, pose: ScoredHypothesis, turn: MeasuredTurn | None) -> CameraMotion:
         """Return the predicted motion; after a loss or a long gap it is unknown, and the rows alone measure it."""
-        return self._filter.predict(stamp) or CameraMotion.at_pose(stamp, pose.T_world_camera, np.eye(6))
+        return self._filter.predict(stamp, turn) or CameraMotion.at_pose(stamp, pose.T_world_camera, np.eye(6))
 
     def _measured(self, predicted: CameraMotion, pose: ScoredHypothesis, prepared: PreparedFrame) -> CameraMotion:
         """Return the state of the motion after the measurement of a pose, and of its rows if no direction is weak."""
@@ -292,3 +343,8 @@ class Tracker:
             self._search.restart()
             self.motion.update(stamp, pose.T_world_camera)
             self._last_covariance = pose.covariance
+
+
+def _better(a: ScoredHypothesis, b: ScoredHypothesis) -> ScoredHypothesis:
+    """Return the pose that is not lost, or that with the smaller residual; of two equal ones the first."""
+    return a if (a.verdict == "lost", a.health.score) <= (b.verdict == "lost", b.health.score) else b

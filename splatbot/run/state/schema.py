@@ -30,6 +30,7 @@ from splatbot.optimize.adam import GaussianAdam
 from splatbot.slam import FrameResult, Slam
 from splatbot.tracking.budget import CostModel
 from splatbot.tracking.features import Features
+from splatbot.tracking.gyroscope import Gyroscope
 from splatbot.tracking.motion_filter import CameraMotion, MotionFilter
 from splatbot.tracking.motion_model import ConstantVelocity
 from splatbot.tracking.reference import Reference, ReferencePoints
@@ -165,6 +166,7 @@ TYPES: Mapping[str, SavedType] = {
             "config",
             "motion",
             "_filter",
+            "_gyroscope",
             "variance_scale",
             "_lost",
             "uncertainties=_keyframe_uncertainty",
@@ -175,7 +177,7 @@ TYPES: Mapping[str, SavedType] = {
         ),
         transient=frozenset({"_stages"}),
         create=lambda config: Tracker(config.tracking),
-        added=frozenset({"filter", "variance_scale"}),
+        added=frozenset({"filter", "gyroscope", "variance_scale"}),
         removed=frozenset({"velocity"}),
     ),
     "motion_model": SavedType(
@@ -185,6 +187,11 @@ TYPES: Mapping[str, SavedType] = {
     ),
     "motion_filter": SavedType(MotionFilter, _fields("_state"), create=lambda _: MotionFilter()),
     "camera_motion": _dataclass(CameraMotion),
+    "gyroscope": SavedType(
+        Gyroscope,
+        _fields("bias", "bias_covariance", "_recent", "_record", "_trust"),
+        create=lambda _: Gyroscope(),
+    ),
     "camera_velocity": SavedType(RemovedObject, _fields("poses"), create=lambda _: RemovedObject()),
     "frame_quality": SavedType(FrameQuality, _fields("_recent"), create=lambda _: FrameQuality()),
     "stage_costs": SavedType(CostModel, _fields("_frame", "_runs"), create=lambda _: CostModel()),
