@@ -1,7 +1,7 @@
 """OAK cameras (Luxonis) with depthai 3: colour, and stereo depth that the device aligns to it.
 
-The pipeline has two parts: the device delivers undistorted colour and aligned depth in millimetres, the host pairs
-them. The host part also runs without a device, on two host nodes that send recorded packets.
+The pipeline has two parts. The device delivers undistorted colour and aligned depth in millimetres; the host pairs
+them and adds the packets of the IMU. The host part also runs without a device, on host nodes with recorded packets.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from datetime import timedelta
 from typing import Any
 
@@ -20,14 +20,33 @@ from splatbot.camera import Camera
 from splatbot.errors import DeviceError
 from splatbot.frame import Frame
 from splatbot.layouts import OAK as PREFIX
+from splatbot.protocols import Array
 from splatbot.robots.cameras.device import CONSTANTS as DEVICE
 from splatbot.robots.cameras.device import RgbdDevice
+from splatbot.robots.cameras.oak_imu import OakImu, factory_rotation, imu_output
 from splatbot.robots.cameras.stream_options import StreamOptions, parse_address
 
 DEFAULT = StreamOptions(width=640, height=400)
 
-MakeStreams = Callable[[Any, StreamOptions], tuple[Any, Any]]
-"""Creates the nodes of a depthai pipeline and returns its outputs of colour and of depth."""
+
+@dataclass(frozen=True)
+class OakStreams:
+    """Outputs of a depthai pipeline.
+
+    Args:
+        color, depth: images.
+        imu: packets of the IMU; None for a device without one.
+        R_camera_imu: (3, 3) axes of the IMU in those of the colour camera.
+    """
+
+    color: Any
+    depth: Any
+    imu: Any = None
+    R_camera_imu: Array = field(default_factory=lambda: np.eye(3))
+
+
+MakeStreams = Callable[[Any, StreamOptions], OakStreams]
+"""Creates the nodes of a depthai pipeline and returns their outputs."""
 
 
 @dataclass(frozen=True)
@@ -81,14 +100,15 @@ class OakCamera(RgbdDevice):
         if self._closed.is_set():
             return
         pipeline = dai.Pipeline(createImplicitDevice=False) if self._streams else dai.Pipeline(self._device(dai))
-        color, depth = (self._streams or device_streams)(pipeline, self.options)
+        streams = (self._streams or device_streams)(pipeline, self.options)
         sync = pipeline.create(dai.node.Sync)
         sync.setRunOnHost(True)
         sync.setSyncThreshold(timedelta(seconds=0.5 / self.options.fps))
-        color.link(sync.inputs["color"])
-        depth.link(sync.inputs["depth"])
+        streams.color.link(sync.inputs["color"])
+        streams.depth.link(sync.inputs["depth"])
         queue = sync.out.createOutputQueue(maxSize=CONSTANTS.queue, blocking=False)
         unix = time.time() - dai.Clock.now().total_seconds()
+        imu = None if streams.imu is None else OakImu(streams.imu, streams.R_camera_imu, unix)
 
         def wait() -> Any:
             if not pipeline.isRunning():
@@ -101,7 +121,8 @@ class OakCamera(RgbdDevice):
         pipeline.start()
         try:
             for pair in self._pairs(wait, lambda pair: pair["color"].getSequenceNum()):
-                yield self._frame(dai, pair["color"], pair["depth"], unix)
+                frame = self._frame(dai, pair["color"], pair["depth"], unix)
+                yield frame if imu is None else replace(frame, imu=imu.until(frame.stamp))
         finally:
             pipeline.stop()
             pipeline.wait()
@@ -144,8 +165,8 @@ class OakCamera(RgbdDevice):
         return self._camera(K[0, 0], K[1, 1], K[0, 2], K[1, 2], size=size, distortion=lens[:8])
 
 
-def device_streams(pipeline: Any, options: StreamOptions) -> tuple[Any, Any]:
-    """Create the nodes of a device: undistorted colour, and stereo depth in its pixels.
+def device_streams(pipeline: Any, options: StreamOptions) -> OakStreams:
+    """Create the nodes of a device: undistorted colour, stereo depth in its pixels, and the IMU if there is one.
 
     RVC2 aligns depth in its stereo node, RVC4 in a node of its own (depthai's example "Depth Align").
     """
@@ -157,13 +178,17 @@ def device_streams(pipeline: Any, options: StreamOptions) -> tuple[Any, Any]:
     stereo.setDefaultProfilePreset(dai.node.StereoDepth.PresetMode.ROBOTICS)
     for socket, side in ((sockets.CAM_B, stereo.left), (sockets.CAM_C, stereo.right)):
         pipeline.create(dai.node.Camera).build(socket).requestOutput((640, 400), fps=options.fps).link(side)
-    if pipeline.getDefaultDevice().getPlatform() == dai.Platform.RVC4:
+    device = pipeline.getDefaultDevice()
+    R_camera_imu = factory_rotation(device)
+    imu = None if R_camera_imu is None else imu_output(pipeline)
+    axes = np.eye(3) if R_camera_imu is None else R_camera_imu
+    if device.getPlatform() == dai.Platform.RVC4:
         align = pipeline.create(dai.node.ImageAlign)
         stereo.depth.link(align.input)
         color.link(align.inputAlignTo)
-        return color, align.outputAligned
+        return OakStreams(color, align.outputAligned, imu, axes)
     color.link(stereo.inputAlignTo)
-    return color, stereo.depth
+    return OakStreams(color, stereo.depth, imu, axes)
 
 
 def _depthai() -> Any:

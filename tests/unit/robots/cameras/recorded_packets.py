@@ -16,6 +16,7 @@ import depthai as dai
 import numpy as np
 from numpy.typing import NDArray
 
+from splatbot.robots.cameras.oak import OakStreams
 from splatbot.robots.cameras.stream_options import StreamOptions
 
 PERIOD_S = 1 / 30
@@ -59,11 +60,58 @@ class Packet:
         return message
 
 
+@dataclass(frozen=True)
+class ImuReport:
+    """Reports of the two sensors in one packet of the IMU; a sensor without a stamp has an empty report.
+
+    Args:
+        gyro_stamp, accel_stamp: [s] of depthai's clock.
+        rate: [rad/s].
+        force: [m/s²].
+        device_offset: time [s] of the device's clock less that of depthai.
+    """
+
+    gyro_stamp: float | None
+    rate: tuple[float, float, float]
+    accel_stamp: float | None
+    force: tuple[float, float, float]
+    device_offset: float = 0.0
+
+    def packet(self) -> Any:
+        """Return it as depthai has it."""
+        packet = dai.IMUPacket()
+        reports = (packet.gyroscope, self.gyro_stamp, self.rate), (packet.acceleroMeter, self.accel_stamp, self.force)
+        for report, stamp, vector in reports:
+            if stamp is not None:
+                report.x, report.y, report.z = vector
+                report.timestamp, report.tsDevice = _timestamp(stamp), _timestamp(stamp + self.device_offset)
+        return packet
+
+
+def _timestamp(seconds: float) -> Any:
+    time = dai.Timestamp()
+    time.sec, time.nsec = int(seconds), round((seconds - int(seconds)) * 1e9)
+    return time
+
+
+@dataclass(frozen=True)
+class ImuMessage:
+    """A batch of packets of the IMU."""
+
+    reports: Sequence[ImuReport]
+
+    def message(self) -> Any:
+        """Return it as depthai has it."""
+        message = dai.IMUData()
+        message.packets = [report.packet() for report in self.reports]
+        return message
+
+
 class _Sender(dai.node.ThreadedHostNode):
     def __init__(self) -> None:
         super().__init__()
         self.out = self.createOutput()
-        self.packets: Sequence[Packet] = ()
+        self.packets: Sequence[Packet | ImuMessage] = ()
 
     def run(self) -> None:
         for packet in self.packets:
@@ -76,14 +124,25 @@ class _Sender(dai.node.ThreadedHostNode):
 class RecordedStreams:
     """Sources of :class:`splatbot.robots.cameras.oak.OakCamera` that send packets."""
 
-    def __init__(self, color: Sequence[Packet], depth: Sequence[Packet]) -> None:
-        self._color, self._depth = color, depth
+    def __init__(
+        self,
+        color: Sequence[Packet],
+        depth: Sequence[Packet],
+        imu: Sequence[ImuMessage] | None = None,
+        R_camera_imu: NDArray[np.float64] | None = None,
+    ) -> None:
+        self._color, self._depth, self._imu = color, depth, imu
+        self._R_camera_imu = np.eye(3) if R_camera_imu is None else R_camera_imu
 
-    def __call__(self, pipeline: Any, _options: StreamOptions) -> tuple[Any, Any]:
+    def __call__(self, pipeline: Any, _options: StreamOptions) -> OakStreams:
         """Create the nodes in a pipeline and return their outputs."""
-        outputs = []
-        for packets in (self._color, self._depth):
+        outputs: list[Any] = []
+        for packets in (self._color, self._depth, self._imu):
+            if packets is None:
+                outputs.append(None)
+                continue
             sender = pipeline.create(_Sender)
             sender.packets = packets
             outputs.append(sender.out)
-        return outputs[0], outputs[1]
+        color, depth, imu = outputs
+        return OakStreams(color, depth, imu, self._R_camera_imu)
