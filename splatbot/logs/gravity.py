@@ -45,9 +45,9 @@ CONSTANTS = GravityConstants()
 def measured_up(uri: str, trajectory: Trajectory) -> tuple[float, float, float] | None:
     """Return the upward unit vector in the world of a trajectory, or None if the log does not determine it.
 
-    The axes of the accelerometer on the camera are not recorded. The function chooses the rotation by right angles for
-    which gravity has the same direction in the world at all poses. If the motion does not distinguish the 24 rotations,
-    the answer is None.
+    Recordings of ROS topics may state the axes of the accelerometer on the camera. If they do not, or if the poses
+    contradict them, the axes are one of the 24 rotations by right angles. The function chooses that for which gravity
+    has the same direction in the world at all poses. If the motion does not distinguish them, the answer is None.
 
     Args:
         uri: address of the log.
@@ -56,7 +56,7 @@ def measured_up(uri: str, trajectory: Trajectory) -> tuple[float, float, float] 
     Raises:
         LogError: the file is damaged.
     """
-    rows = _accelerations(uri)
+    rows, has_axes = _accelerations(uri)
     if rows is None or len(trajectory) < CONSTANTS.min_poses:
         return None
     steady = [(T[:3, :3], mean) for stamp, T in _poses(trajectory) if (mean := _mean_around(rows, stamp)) is not None]
@@ -64,6 +64,10 @@ def measured_up(uri: str, trajectory: Trajectory) -> tuple[float, float, float] 
         return None
     R = np.stack([rotation for rotation, _ in steady])
     a = np.stack([mean / np.linalg.norm(mean) for _, mean in steady])
+    spread, stated = _spread(R, a)
+    if has_axes and spread <= CONSTANTS.max_spread:
+        x, y, z = stated.tolist()
+        return (x, y, z)
     found = sorted((_spread(R @ axes, a) for axes in _right_angles()), key=lambda pair: pair[0])
     best, second = found[0], found[1]
     if best[0] > CONSTANTS.max_spread or second[0] < CONSTANTS.min_ratio * best[0]:
@@ -72,21 +76,24 @@ def measured_up(uri: str, trajectory: Trajectory) -> tuple[float, float, float] 
     return (x, y, z)
 
 
-def _accelerations(uri: str) -> NDArray[np.float64] | None:
-    """Return stamps and specific forces (N, 4), or None if the log has none."""
+def _accelerations(uri: str) -> tuple[NDArray[np.float64] | None, bool]:
+    """Return stamps and specific forces (N, 4), None if the log has none, and whether their axes are the camera's."""
     path = Path(uri) / NAME
     if path.is_file():
-        return _read_text(path)
+        return _read_text(path), False
     if not Path(uri.partition("?")[0]).exists() or log_kind(uri) != "bag":
-        return None
+        return None, False
     from splatbot.logs.bag import KEYS, BagLog  # rosbags builds its message classes when imported
 
     place, options = split_address(uri, KEYS)
     low, high = CONSTANTS.gravity
-    # A topic of a gyroscope has zeros; a camera that hardly accelerates measures gravity.
-    topics = BagLog(place, options=options).accelerations().values()
-    still = [rows for rows in topics if len(rows) and low < np.median(np.linalg.norm(rows[:, 1:], axis=1)) < high]
-    return max(still, key=len, default=None)
+    log = BagLog(place, options=options)
+    if log.imu is not None and len(log.imu.accel_stamps):
+        return log.imu.accelerometer, True
+    # A camera that hardly accelerates measures gravity.
+    topics = log.accelerations().values()
+    still = [rows for rows in topics if low < np.median(np.linalg.norm(rows[:, 1:], axis=1)) < high]
+    return max(still, key=len, default=None), False
 
 
 def _read_text(path: Path) -> NDArray[np.float64]:

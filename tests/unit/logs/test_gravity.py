@@ -13,7 +13,9 @@ from rosbags.typesys import Stores, get_typestore
 
 from splatbot.errors import LogError
 from splatbot.geometry import so3_exp
+from splatbot.logs import open_log
 from splatbot.logs.gravity import NAME, measured_up
+from splatbot.logs.mcap import record_mcap
 from splatbot.trajectory import Trajectory
 
 _UP = np.array([0.2, -0.9, -0.3]) / np.linalg.norm([0.2, -0.9, -0.3])
@@ -81,6 +83,14 @@ def test_imu_topics_of_a_recording_give_it_and_those_of_a_gyroscope_do_not(tmp_p
     found = measured_up(str(tmp_path / "bag"), trajectory)
     assert found is not None
     assert np.degrees(np.arccos(np.clip(np.dot(found, _UP), -1, 1))) < 1.0
+
+
+def test_a_recording_with_known_axes_knows_it_without_motion(tmp_path: Path) -> None:
+    log = open_log("synthetic:tabletop?width=32&height=24&trajectory=handheld&frames=30&imu=100")
+    assert log.ground_truth is not None
+    found = measured_up(str(record_mcap(log, tmp_path / "a.mcap")), log.ground_truth)
+    assert found is not None
+    assert np.degrees(np.arccos(np.clip(np.dot(found, [0, 0, 1]), -1, 1))) < 3.0  # 0.2 m/s² of bias are 1.2° an axis
 
 
 def test_a_camera_that_hardly_turns_cannot_tell(tmp_path: Path) -> None:
