@@ -147,18 +147,18 @@ def test_a_resumed_training_of_surfels_has_the_map_of_one_that_was_not_stopped(t
 @pytest.mark.long
 def test_the_commands_read_a_trained_map_of_surfels(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene, out = write_blender_scene(tmp_path, 10), tmp_path / "out"
-    words = ["--surfels", "--max-gaussians", "1500", "--quiet", "--iterations", "300", "--out", str(out)]
+    words = ["--surfels", "--max-gaussians", "800", "--quiet", "--iterations", "150", "--out", str(out)]
     assert main(["train", str(scene), *words]) == 0
     assert holds_surfels(GaussianModel.load(out / "map.ply"))
     assert main(["eval", str(out), "--json"]) == 0
     scores, saved = json.loads(capsys.readouterr().out), json.loads((out / "scores.json").read_text())
     assert saved | scores == saved
-    assert scores["psnr_db"] > 20
+    assert scores["psnr_db"] > 18
     assert main(["render", str(out), "--index", "0", "--out", str(tmp_path / "view.png")]) == 0
     assert main(["info", str(out)]) == 0
     assert "surfels" in capsys.readouterr().out
     for method in ("median", "depth", "poisson"):
         mesh = tmp_path / method
-        words = ["--format", "mesh", "--mesh-from", method, "--voxel", "0.1", "--out", str(mesh)]
+        words = ["--format", "mesh", "--mesh-from", method, "--voxel", "0.2", "--out", str(mesh)]
         assert main(["export", str(out), *words]) == 0
-        assert (mesh / "mesh.ply").stat().st_size > 10_000
+        assert (mesh / "mesh.ply").stat().st_size > 5_000
