@@ -7,7 +7,6 @@ import logging
 import threading
 import time
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,7 +16,7 @@ from splatbot.frame import Frame
 from splatbot.geometry import inverse, transform_points
 from splatbot.logs import Log
 from splatbot.logs.joints import MAX_GAP, interpolate_joints, select_joints
-from splatbot.mapping.selfmask import JointsUnknownError, SelfMask
+from splatbot.mapping.selfmask import SAME_TIME_S, JointsUnknownError, SelfMask, knows_joints
 from splatbot.protocols import Array, FrameSource
 from splatbot.robots.in_view import recorded_links, self_mask
 from splatbot.robots.joint_offsets import robot_in_scene
@@ -34,7 +33,6 @@ _KEPT_S = 10.0  # [s] of joint states
 _SET_BACK_S = 0.5  # [s] by which a state may be older than the newest one
 _KEPT = 20_000  # joint states: 2 kHz over that time
 _WAIT_S = 0.15  # [s] for the joint state after an image
-_SAME_TIME_S = 1e-3  # [s] between colour and depth in which an arm moves by less than the noise of depth
 _REPORT_S = 10.0  # [s] between two warnings about frames that are not mapped
 
 _log = logging.getLogger(__name__)
@@ -130,10 +128,11 @@ class JointHistory:
 class RobotMask:
     """Masks the robot, and the object in its hand, in the frames of one live map.
 
-    A frame with joints of its own is masked by these. Otherwise its joints are those of the history at the frame's
-    stamp plus the workspace's ``joint_delay``. Where no joint states come, the poses of the links are those of TF at
-    that time. So is the pose of the camera if it is not known on its link; then TF counts alone. A frame without known
-    joints or poses is refused: it must not be mapped. So is a frame of a further camera without a workspace of its own.
+    A frame with joints of its own at the times of colour and depth is masked by these. Otherwise its joints are those
+    of the history at both times, plus the workspace's ``joint_delay``. Where no joint states come, the poses of the
+    links are those of TF. So is the pose of the camera if it is not known on its link; then TF counts alone. A frame
+    without known joints or poses is refused: it must not be mapped. So is a frame of a further camera without a
+    workspace of its own.
 
     Frames of a recording are masked as `splatbot map --robot` does it: by their own joints, else by the recorded TF.
 
@@ -202,9 +201,9 @@ class RobotMask:
             links = self._recorded.get(frame.camera_name)
             if links is not None:
                 masked = links.mask(self._mask_of(frame), frame)
-            elif live and frame.joints is None:
+            elif live and not knows_joints(frame):
                 masked = self._masked_at(frame, 0.0)
-                if abs(frame.depth_delay) > _SAME_TIME_S:
+                if abs(frame.depth_delay) > SAME_TIME_S:
                     masked = self._masked_at(masked, frame.depth_delay)
             else:
                 masked = self._mask_of(frame)(frame)
@@ -238,7 +237,7 @@ class RobotMask:
         if not mask.has_camera or (self._link_poses and not come):
             return self._link_poses.mask(mask, frame, stamp, wait_s)
         q = self.history.at(stamp, wait_s)
-        return mask(replace(frame, joints=q, joint_names=self.history.names))
+        return mask.at_joints(frame, q, self.history.names)
 
     def hold(self, spheres: ArrayLike) -> None:
         """Mask an object in the hand from the next frame on, in addition to the attached ones of MoveIt.

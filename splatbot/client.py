@@ -240,6 +240,7 @@ class Client(AbstractContextManager["Client"]):
             "joints": None if frame.joints is None else frame.joints.tolist(),
             "joint_names": list(frame.joint_names),
             "camera_name": frame.camera_name,
+            "depth_joints": None if frame.depth_joints is None else frame.depth_joints.tolist(),
         }
         answer = self._packed("POST", _map_path(map_id, "frames"), body)
         return _result(TrackedFrame, answer)

@@ -71,6 +71,8 @@ class Frame:
         camera_name: name of the camera where several cameras map; empty for the first one.
         imu: samples of the camera's inertial sensor since the previous frame, on the clock of ``stamp``. If None, there
             is no sensor or its axes are unknown.
+        depth_joints: positions (n,) [rad] of ``joints`` at the time of depth, where that is another time; NaN where a
+            joint is not known.
 
     Raises:
         InputError: sizes differ, a type is wrong or depth is negative.
@@ -89,6 +91,7 @@ class Frame:
     joint_names: tuple[str, ...] = ()
     camera_name: str = ""
     imu: ImuSamples | None = field(default=None, compare=False)
+    depth_joints: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
         where = self.source or f"frame {self.index}"
@@ -128,6 +131,9 @@ class Frame:
         if self.joint_names and (self.joints is None or len(self.joint_names) != len(self.joints)):
             hint = "name every joint, or none"
             raise InputError(f"has {len(self.joint_names)} names.", file=where, field="joint_names", hint=hint)
+        if self.depth_joints is not None and (self.joints is None or len(self.depth_joints) != len(self.joints)):
+            hint = "give the joints at both times, as many and in the same order"
+            raise InputError(f"has {len(self.depth_joints)} positions.", file=where, field="depth_joints", hint=hint)
         if not np.isfinite(self.depth).all():
             object.__setattr__(self, "depth", np.nan_to_num(self.depth, nan=0.0, posinf=0.0, neginf=0.0))
         if (self.depth < 0).any():

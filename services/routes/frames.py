@@ -51,6 +51,9 @@ class FrameRequest(Body):
     joint_names: list[str] = Field(
         [], max_length=MAX_JOINTS, description="of `joints`; if empty, they are in the robot's order"
     )
+    depth_joints: list[float] | None = Field(
+        None, max_length=MAX_JOINTS, description="`joints` at the time of depth, where `depth_delay` is not 0"
+    )
 
     @field_validator("rgb", "depth", "mask", mode="before")
     @classmethod
@@ -160,9 +163,7 @@ def _frame(query: FrameRequest, max_pixels: int) -> Frame:
     depth = _decoded(query.depth, "depth", cv2.IMREAD_UNCHANGED, max_pixels)
     if depth.dtype.kind in "iu":
         depth = depth.astype(np.float32) / np.float32(query.depth_scale)
-    joints = None if query.joints is None else np.array(query.joints, dtype=np.float64)
-    if joints is not None and not np.isfinite(joints).all():
-        raise InputError("has values that are not finite.", field="joints", hint="give radians and metres")
+    joints, depth_joints = _positions(query.joints, "joints"), _positions(query.depth_joints, "depth_joints")
     mask = None if query.mask is None else _decoded(query.mask, "mask", cv2.IMREAD_GRAYSCALE, max_pixels) > 0
     rgb, depth = np.ascontiguousarray(rgb), np.ascontiguousarray(depth)
     return Frame(
@@ -176,7 +177,15 @@ def _frame(query: FrameRequest, max_pixels: int) -> Frame:
         depth_delay=query.depth_delay,
         source="the pushed frame",
         camera_name=query.camera_name,
+        depth_joints=depth_joints,
     )
+
+
+def _positions(given: list[float] | None, field: str) -> NDArray[np.float64] | None:
+    positions = None if given is None else np.array(given, dtype=np.float64)
+    if positions is not None and not np.isfinite(positions).all():
+        raise InputError("has values that are not finite.", field=field, hint="give radians and metres")
+    return positions
 
 
 def _decoded(value: Any, field: str, flags: int, max_pixels: int) -> NDArray[Any]:

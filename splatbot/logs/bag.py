@@ -166,6 +166,7 @@ class BagLog(StampedLog):
         mask = self._mask(color.stamp)
         where = f"{self.path} {self._color} {index}"
         names, joints = self._joints.at(color.stamp + self._joint_delay) or ((), None)
+        moved = joints is not None and depth.stamp != color.stamp
         try:
             rgb, z = self._cameras.images(rgb, z)
             return RosFrame(
@@ -181,6 +182,7 @@ class BagLog(StampedLog):
                 joint_names=names,
                 camera_frame=self._camera_frame,
                 imu=self._imu_samples(index),
+                depth_joints=self._joints.of(names, depth.stamp + self._joint_delay) if moved else None,
             )
         except InputError as error:
             raise LogError(error.message, file=where, field=error.field, hint=error.hint) from error

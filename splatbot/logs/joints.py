@@ -125,6 +125,18 @@ class JointStates:
             return tuple(named), np.array(list(named.values()))
         return next((((), positions) for names, positions in found if not names and positions is not None), None)
 
+    def of(self, names: Sequence[str], stamp: float) -> NDArray[np.float64] | None:
+        """Interpolate the joints with given names at a stamp [s]: positions (J,), NaN where one is not known.
+
+        Returns:
+            None if no joint is known, or others than those without names are.
+        """
+        found = self.at(stamp)
+        if found is None or bool(found[0]) != bool(names):
+            return None
+        known = dict(zip(found[0], found[1].tolist(), strict=True)) if names else {}
+        return np.array([known.get(name, np.nan) for name in names]) if names else found[1]
+
 
 def select_joints(names: Sequence[str], positions: NDArray[np.float64], wanted: Sequence[str]) -> NDArray[np.float64]:
     """Return the positions (J,) of the ``wanted`` joints, in their order.

@@ -20,7 +20,7 @@ FindTransform = Callable[[str, str], Array | None]
 class CameraPair:
     """Removes the distortion of colour and depth, and puts colour of another camera at the pixels of depth.
 
-    The undistorted images have the intrinsic matrices of the recorded ones. They show the middle part of a fisheye image.
+    The undistorted images have the intrinsic matrices of the recorded ones. They show the middle of a fisheye image.
 
     Args:
         color: colour camera.

@@ -45,7 +45,8 @@ class TumLog(FolderLog, StampedLog):
     Masks mark valid pixels in white and excluded pixels in black, such as the gripper or the robot's own arm. They are
     read from `mask.png` for all frames, or from `mask.txt` (lines `stamp path`) for single frames.
 
-    `joints.txt` (lines `stamp q1 q2 ...`) holds the joint positions, which are interpolated to each frame's stamp.
+    `joints.txt` (lines `stamp q1 q2 ...`) holds the joint positions, which are interpolated to the stamps of colour and
+    depth.
 
     Args:
         folder: of the log.
@@ -110,7 +111,9 @@ class TumLog(FolderLog, StampedLog):
         frame = replace(frame, depth_delay=depth.stamp - color.stamp)
         if self._joints is None:
             return frame
-        return replace(frame, joints=self._joints.at(color.stamp + self._joint_delay), joint_names=self._joints.names)
+        joints = self._joints.at(color.stamp + self._joint_delay)
+        later = None if joints is None or not frame.depth_delay else self._joints.at(depth.stamp + self._joint_delay)
+        return replace(frame, joints=joints, joint_names=self._joints.names, depth_joints=later)
 
     def _pair(self, colors: list[IndexEntry]) -> dict[int, IndexEntry]:
         a, b = (np.array([entry.stamp for entry in entries]) for entries in (colors, self._depths))

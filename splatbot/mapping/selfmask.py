@@ -17,6 +17,7 @@ from splatbot.logs.joints import select_joints
 from splatbot.protocols import Array, RobotKinematics
 
 REACH = 0.02  # [m] distance from the robot's spheres that counts as the robot
+SAME_TIME_S = 1e-3  # [s] between colour and depth in which an arm moves by less than the noise of depth
 
 
 class JointsUnknownError(InputError):
@@ -30,6 +31,9 @@ class SelfMask:
 
     A pixel is masked if its ray meets an enlarged sphere at or in front of the measured depth, or without a measured
     depth. It is also masked if its measured point lies in such a sphere. Objects in front of the robot remain.
+
+    Where depth is of another time than colour, the pixels that may show the robot at one of both times are masked. A
+    surface that only one of the images shows is no surface of the scene.
 
     Args:
         robot: joints, links and the spheres that cover them.
@@ -87,28 +91,63 @@ class SelfMask:
         return self._T_link_camera is not None
 
     def __call__(self, frame: Frame) -> Frame:
-        """Return the frame with the robot removed from its mask.
+        """Return the frame with the robot at the times of colour and of depth removed from its mask.
 
         Raises:
-            JointsUnknownError: The frame has no joints or too few.
+            JointsUnknownError: The frame has no joints or too few at one of both times.
         """
-        free = self.usable(frame)
-        return replace(frame, mask=free if frame.mask is None else frame.mask & free)
+        masked = self.at_joints(frame, frame.joints, frame.joint_names)
+        if abs(frame.depth_delay) <= SAME_TIME_S:
+            return masked
+        return self.at_joints(masked, frame.depth_joints, frame.joint_names, time="the time of depth")
 
     def usable(self, frame: Frame) -> NDArray[np.bool_]:
-        """Compute the pixels (H, W) that do not show the robot.
+        """Compute the pixels (H, W) that do not show the robot at the frame's stamp.
 
         Raises:
             JointsUnknownError: The frame has no joints or too few.
         """
+        return self._free(frame, frame.joints, frame.joint_names, "its time")
+
+    def at_joints(
+        self,
+        frame: Frame,
+        joints: NDArray[np.float64] | None,
+        names: Sequence[str],
+        *,
+        time: str = "its time",
+    ) -> Frame:
+        """Return the frame with the robot at given joint positions removed from its mask.
+
+        Args:
+            frame: the frame; its joints do not count.
+            joints: positions (n,) [rad or m], or None where they are not known.
+            names: of ``joints``; if empty, they are in the order of the robot.
+            time: of the positions, for messages.
+
+        Raises:
+            JointsUnknownError: a joint is not known.
+        """
+        return _narrowed(frame, self._free(frame, joints, names, time))
+
+    def _free(
+        self, frame: Frame, joints: NDArray[np.float64] | None, names: Sequence[str], time: str
+    ) -> NDArray[np.bool_]:
+        """Compute the pixels (H, W) that do not show the robot at joint positions (n,)."""
         where = frame.source or f"frame {frame.index}"
-        if frame.joints is None:
-            hint = f"record the joints of {self._arm.robot.name} at 10 Hz or more, or map without its mask"
-            raise JointsUnknownError("has no joints at its time.", file=where, field="joints", hint=hint)
+        hint = (
+            f"record the joints of {self._arm.robot.name} at 10 Hz or more, leave such frames out "
+            "(--on-bad-frame skip), or map without its mask"
+        )
+        if joints is None:
+            raise JointsUnknownError(f"has no joints at {time}.", file=where, field="joints", hint=hint)
         try:
-            q = select_joints(frame.joint_names, frame.joints, self._names) + self.joint_offsets
+            q = select_joints(names, joints, self._names) + self.joint_offsets
         except InputError as error:
             raise JointsUnknownError(error.message, file=where, field=error.field, hint=error.hint) from error
+        if not np.isfinite(q).all():
+            missing = self._names[int(np.argmin(np.isfinite(q)))]
+            raise JointsUnknownError(f"has no joint {missing} at {time}.", file=where, field="joints", hint=hint)
         return self._seen(frame, self._arm.forward(q)[0], None)
 
     def at_poses(self, frame: Frame, T_link: ArrayLike, T_camera: ArrayLike | None = None) -> Frame:
@@ -122,8 +161,7 @@ class SelfMask:
         Raises:
             JointsUnknownError: the pose of the camera is not given, and not known on its link.
         """
-        free = self._seen(frame, np.asarray(T_link, np.float64), T_camera)
-        return replace(frame, mask=free if frame.mask is None else frame.mask & free)
+        return _narrowed(frame, self._seen(frame, np.asarray(T_link, np.float64), T_camera))
 
     def _seen(self, frame: Frame, T_link: Array, T_camera: ArrayLike | None) -> NDArray[np.bool_]:
         """Compute the pixels (H, W) that do not show the robot at poses (J + 1, 4, 4) of its links."""
@@ -138,6 +176,17 @@ class SelfMask:
         for center, radius in zip(centers, self._radii, strict=True):
             _hide(hidden, frame.depth, frame.camera, center, float(radius))
         return ~hidden
+
+
+def knows_joints(frame: Frame) -> bool:
+    """Return whether a frame has joints of its own at the times of both of its images."""
+    moved = abs(frame.depth_delay) > SAME_TIME_S
+    return frame.joints is not None and not (moved and frame.depth_joints is None)
+
+
+def _narrowed(frame: Frame, free: NDArray[np.bool_]) -> Frame:
+    """Return the frame with a mask of the pixels (H, W) that were usable and are free."""
+    return replace(frame, mask=free if frame.mask is None else frame.mask & free)
 
 
 def _is_rigid(T: Array) -> bool:
