@@ -80,7 +80,7 @@ class RobotSpheres:
             :func:`splatbot.collision.surface_error`.
 
     Raises:
-        InputError: T_world_base is no rigid pose, attached or margin is invalid, or the arm exceeds 16 joints, 256
+        InputError: T_world_base is no rigid pose, attached or margin is invalid, or the arm exceeds 16 joints, 640
             spheres or 256 pairs.
     """
 

@@ -17,12 +17,17 @@ class AttachedConstants:
     """Constants of the spheres of an attached object.
 
     Args:
+        max_spheres: largest number of spheres. Fewer are larger, and reach farther beyond the object.
+        max_arm_spheres: the same with the spheres of an arm, that collision checks take (kMostSpheres in
+            arm_kernels.hpp).
         finest_cell: [m] smallest cell size that is tried.
         coarsening: factor on the cell size until the number of spheres fits.
         sigmas: standard deviations to which the Gaussians of an attached object are inflated.
         enclosed_sides: axis directions of six in which the object must surround a stray Gaussian; a cup is open in one.
     """
 
+    max_spheres: int = 300
+    max_arm_spheres: int = 640
     finest_cell: float = 0.01
     coarsening: float = 1.25
     sigmas: float = 1.0
@@ -32,7 +37,7 @@ class AttachedConstants:
 CONSTANTS = AttachedConstants()
 
 
-def covering_spheres(points: Array, reach: Array, *, max_spheres: int = 100) -> Array:
+def covering_spheres(points: Array, reach: Array, *, max_spheres: int = CONSTANTS.max_spheres) -> Array:
     """Cover balls around points by at most ``max_spheres`` spheres (A, 4), (x, y, z, radius) [m].
 
     Points are grouped by the cubes of a grid, which is coarsened until there are few enough cubes. Each sphere is
@@ -66,15 +71,14 @@ def covering_spheres(points: Array, reach: Array, *, max_spheres: int = 100) -> 
     return np.c_[center, radius]
 
 
-def object_spheres(surface: GraspSurface) -> Array:
+def object_spheres(surface: GraspSurface, *, max_spheres: int = CONSTANTS.max_spheres) -> Array:
     """Cover a surface, completed on its unobserved sides, by spheres (A, 4) (x, y, z, radius) [m, world].
 
     Each surface point is inflated by its sampling radius where it was completed, and by its standard deviation along
     the normal.
     """
-    return covering_spheres(
-        surface.points, np.where(surface.observed, 0.0, surface.spread) + CONSTANTS.sigmas * surface.normal_std
-    )
+    reach = np.where(surface.observed, 0.0, surface.spread) + CONSTANTS.sigmas * surface.normal_std
+    return covering_spheres(surface.points, reach, max_spheres=max_spheres)
 
 
 def within(points: Array, spheres: Array) -> NDArray[np.bool_]:

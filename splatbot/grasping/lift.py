@@ -10,6 +10,7 @@ import numpy as np
 from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.geometry import inverse, transform_points
 from splatbot.grasping.affordance import Target
+from splatbot.grasping.attached import CONSTANTS as ATTACHED
 from splatbot.grasping.attached import object_spheres
 from splatbot.grasping.obstacles import Surfaces
 from splatbot.planning import Path
@@ -90,8 +91,12 @@ def lift_target(
 
 
 def target_spheres(sampler: GraspSampler, target: Target) -> Array:
-    """Cover the completed surface of a target by spheres; see :func:`splatbot.grasping.attached.object_spheres`."""
-    return object_spheres(sampler.surface(target))
+    """Cover the completed surface of a target by spheres (A, 4), at most as many as the arm can carry with its own.
+
+    See :func:`splatbot.grasping.attached.object_spheres`.
+    """
+    room = max(1, ATTACHED.max_arm_spheres - len(sampler.robot.spheres()))
+    return object_spheres(sampler.surface(target), max_spheres=min(ATTACHED.max_spheres, room))
 
 
 def in_hand(arm: RobotSpheres, q: Array, spheres: Array) -> Array:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from splatbot.errors import GripperError, InputError
 from splatbot.gaussians import GaussianModel
 from splatbot.grasping.affordance import Target
 from splatbot.grasping.attached import covering_spheres, within
+from splatbot.grasping.lift import target_spheres
 from splatbot.grasping.options import GraspOptions
 from splatbot.grasping.pick import Picker
 from splatbot.grasping.pick_planner import MapPickPlanner, PickPlan, Segment
@@ -347,6 +349,22 @@ def test_spheres_of_a_held_object_cover_it_and_are_few() -> None:
     assert (inside.max(axis=1) >= reach - 1e-12).all()
     with pytest.raises(InputError):
         covering_spheres(points[:0], reach[:0])
+
+
+def test_spheres_of_a_held_box_reach_less_than_9_mm_beyond_it() -> None:
+    half = 0.05
+    u, v = (grid.ravel() for grid in np.meshgrid(*2 * [np.linspace(-half, half, 26)]))
+    faces = [np.insert(np.c_[u, v], axis, side, axis=1) for axis in range(3) for side in (-half, half)]
+    spheres = covering_spheres(np.concatenate(faces), np.zeros(6 * len(u)))
+    assert (np.abs(spheres[:, :3]).max(axis=1) + spheres[:, 3]).max() < half + 0.009
+
+
+@pytest.mark.parametrize(("own", "most"), [(249, 300), (600, 40), (640, 1)])
+def test_an_arm_with_many_spheres_carries_an_object_of_fewer(own: int, most: int) -> None:
+    carried = sampler()
+    arm = SimpleNamespace(spheres=lambda: range(own))
+    few: Any = SimpleNamespace(robot=arm, surface=carried.surface)
+    assert most / 3 <= len(target_spheres(few, target("can"))) <= most
 
 
 def test_points_inside_of_an_object_belong_to_it_and_points_around_it_do_not() -> None:
