@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from splatbot.geometry import inverse, se3_exp, se3_log
+from splatbot.geometry import inverse, se3_exp, se3_log, so3_exp
 from splatbot.tracking.align import Alignment
+from splatbot.tracking.gyroscope import MeasuredTurn
 from splatbot.tracking.motion_filter import CONSTANTS, CameraMotion, MotionFilter, mean_twist
 
 TURN = np.array([0.0, 0.0, 0.0, 0.0, 1.0, 0.0])
@@ -148,3 +149,32 @@ def test_a_mean_velocity_needs_a_short_time() -> None:
     np.testing.assert_allclose(mean_twist(se3_exp(0.05 * TURN), 0.05), TURN, atol=1e-12)
     assert not mean_twist(se3_exp(TURN), 1.0).any()
     assert not mean_twist(se3_exp(TURN), 0.0).any()
+
+
+def test_a_rotation_of_the_gyroscope_replaces_that_of_the_velocity_with_its_errors() -> None:
+    """Oracle: 800 true motions with errors of the stated covariances; the errors of the prediction have its own."""
+    rng, dt, R = np.random.default_rng(5), 0.03, so3_exp([0.1, -0.2, 0.05])
+    P = np.diag(np.repeat([0.005, 0.004, 0.2, 1.0], 3) ** 2)
+    mix = 1e-3 * rng.normal(size=(6, 6)) * np.repeat([1.0, 30.0], 3)[:, None]
+    turn = MeasuredTurn(R, np.array([3.0, -6.0, 2.0]), mix @ mix.T, -dt * np.eye(3), dt)
+    start = CameraMotion(1.0, se3_exp([0.3, 0.1, -0.2, 0.5, 0.2, 1.0]), np.array([0.4, -0.2, 0.1, 9, 9, 9]), P)
+    predicted = start.predict_turn(1.0 + dt, turn)
+    np.testing.assert_allclose(predicted.T_world_camera[:3, :3], start.T_world_camera[:3, :3] @ R, atol=1e-12)
+    np.testing.assert_array_equal(predicted.twist, [0.4, -0.2, 0.1, 3, -6, 2])
+    errors = []
+    for x, e in zip(
+        rng.multivariate_normal(np.zeros(12), P, 800),
+        rng.multivariate_normal(np.zeros(6), turn.covariance, 800),
+        strict=True,
+    ):
+        motion = np.r_[dt * (start.twist[:3] + x[6:9]), se3_log(_rotation(R @ so3_exp(e[:3])))[3:]]
+        true = start.T_world_camera @ se3_exp(x[:6]) @ se3_exp(motion)
+        errors.append(np.r_[se3_log(inverse(predicted.T_world_camera) @ true), x[6:9], e[3:]])
+    whitened = np.linalg.solve(np.linalg.cholesky(predicted.covariance), np.array(errors).T)
+    np.testing.assert_allclose(np.cov(whitened), np.eye(12), atol=0.25)
+
+
+def _rotation(R: np.ndarray) -> np.ndarray:
+    T = np.eye(4)
+    T[:3, :3] = R
+    return T

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from splatbot.geometry import skew
-from splatbot.tracking.motion_model import ConstantVelocity
+from splatbot.geometry import skew, so3_exp
+from splatbot.tracking.gyroscope import MeasuredTurn, Trust
+from splatbot.tracking.motion_model import CONSTANTS, ConstantVelocity
 
 TWIST = np.array([0.3, -0.2, 0.5, 0.4, 0.1, -0.6])  # per second: (m, rad)
 START = np.array([[0.0, -1.0, 0.0, 1.0], [1.0, 0.0, 0.0, -2.0], [0.0, 0.0, 1.0, 0.5], [0.0, 0.0, 0.0, 1.0]])
@@ -68,3 +69,18 @@ def test_stamps_that_do_not_increase_predict_rest(stamps: tuple[float, float]) -
 
 def test_a_stamp_that_repeats_predicts_the_same_pose() -> None:
     np.testing.assert_array_equal(updated(0.0, 0.1).predict(0.1), pose(0.1))
+
+
+@pytest.mark.parametrize("trust", ["new", "proven", "doubted"])
+def test_a_gyroscope_gives_the_rotation_also_of_lost_frames_unless_it_is_doubted(trust: Trust) -> None:
+    R, covariance = so3_exp([0.3, -0.4, 0.2]), np.diag(np.repeat([1e-4, 1e-2], 3))
+    turn = MeasuredTurn(R, np.zeros(3), covariance, np.zeros((3, 3)), 0.2, trust)
+    motion = updated(0.0, 0.1)
+    motion.forget_velocity()
+    found, plain = motion.motion_prior(0.3, np.zeros((6, 6)), turn), motion.motion_prior(0.3, np.zeros((6, 6)))
+    np.testing.assert_array_equal(found.covariance[:3, :3], plain.covariance[:3, :3])
+    np.testing.assert_array_equal(found.T_world_camera[:3, 3], pose(0.1)[:3, 3])
+    expected = pose(0.1)[:3, :3] @ (np.eye(3) if trust == "doubted" else R)
+    np.testing.assert_allclose(found.T_world_camera[:3, :3], expected, atol=1e-12)
+    variance = plain.covariance[3, 3] if trust == "doubted" else 1e-4 + CONSTANTS.rest**2
+    np.testing.assert_allclose(found.covariance[3:, 3:], variance * np.eye(3), atol=1e-12)
