@@ -106,8 +106,14 @@ def workspace_of(uri: str, robot_base: Any) -> Workspace | None:
     return Workspace(T_world_base=robot_base, joint_offsets=arm.joint_offsets, offsets_of=arm.offsets_of)
 
 
-def open_rig(uri: str) -> tuple[Log, dict[str, Workspace]]:
+def open_rig(
+    uri: str, describe_first: Callable[[Workspace | None], Workspace] = lambda known: known or Workspace()
+) -> tuple[RigLog, dict[str, Workspace]]:
     """Open the recordings of several cameras, each with the joints of its own ``scene.yaml``.
+
+    Args:
+        uri: the file of the rig.
+        describe_first: returns the workspace of the first camera for that of its ``scene.yaml``.
 
     Returns:
         The log, and the workspaces of its cameras by name: of further ones those with a mount on the robot, or with TF.
@@ -119,7 +125,8 @@ def open_rig(uri: str) -> tuple[Log, dict[str, Workspace]]:
     found: list[Workspace] = []
 
     def open_one(address: str, camera: str | None) -> Log:
-        found.append(find_workspace(address) or Workspace())
+        known = find_workspace(address)
+        found.append((known or Workspace()) if found else describe_first(known))
         return open_log(address, camera=camera, joint_delay=found[-1].joint_delay)
 
     log = RigLog(uri, open_one)

@@ -6,6 +6,7 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import IO, BinaryIO
 
@@ -16,6 +17,7 @@ from splatbot.logs.index import read_index
 from splatbot.logs.presets import PRESETS
 from splatbot.logs.synthetic import read_options
 from splatbot.services.problems import DISK_ERRORS, TooLargeError
+from splatbot.services.rig_files import SUFFIXES, check_rig
 from splatbot.workspace import NAME as SCENE
 
 _SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".txt", ".json", ".yaml"})
@@ -34,12 +36,14 @@ _MAX_DOCUMENT = 1 << 20  # bytes of a JSON or YAML file
 def allowed_log(uri: str, roots: Sequence[str], *, camera: str | None = None, max_frames: int, max_pixels: int) -> str:
     """Return the address of the log that a client names: synthetic, or under one of ``roots``, links resolved.
 
-    Under a root it is a folder, or the file of a recording of ROS topics.
+    Under a root it is a folder, the file of a recording of ROS topics, or the file of a rig of such recordings.
 
     Raises:
         InputError: it is elsewhere, whether or not there is something.
-        LogError: its lists are damaged, or lead out of it.
-        TooLargeError: a synthetic log has more than ``max_frames`` frames, or more than ``max_pixels`` a frame.
+        LogError: its lists are damaged, or lead out of it. A rig names something else than recordings under a root.
+        CameraError: a camera file of a rig is damaged.
+        TooLargeError: a synthetic log has more than ``max_frames`` frames, or more than ``max_pixels`` a frame. A rig
+            has more than 64 KiB.
     """
     if camera is not None and camera not in PRESETS:
         raise InputError(f"is {camera[:80]!r}.", field="camera", hint=f"presets: {', '.join(PRESETS)}")
@@ -55,17 +59,31 @@ def allowed_log(uri: str, roots: Sequence[str], *, camera: str | None = None, ma
             )
         return uri
     if "\x00" not in uri and len(uri) <= _MAX_URI:
-        for root in (Path(root).resolve() for root in roots):
+        resolved = [Path(root).resolve() for root in roots]
+        for root in resolved:
             place = (root / uri).resolve()  # an absolute uri is used as it is
             if not place.is_relative_to(root):
                 continue
-            if place.is_dir():
-                stays_inside(place)
+            if place.suffix.lower() in SUFFIXES and place.is_file():
+                check_camera = partial(check_camera_file, max_pixels=max_pixels)
+                check_rig(place, resolved, is_recording=_is_recording, check_camera=check_camera)
                 return str(place)
-            if place.is_file() and place.suffix.lower() in _BAGS:
+            if _is_recording(place):
                 return str(place)
-    hint = "name a recording under one of the service's log roots (SPLATBOT_LOG_ROOTS), or synthetic:SCENE"
+    hint = "name a recording or a rig under one of the service's log roots (SPLATBOT_LOG_ROOTS), or synthetic:SCENE"
     raise InputError("is no recording that may be mapped.", field="log", hint=hint)
+
+
+def _is_recording(place: Path) -> bool:
+    """Return whether a place is a folder whose lists stay inside, or the file of a recording of ROS topics.
+
+    Raises:
+        LogError: a list leads out, or is damaged.
+    """
+    if place.is_dir():
+        stays_inside(place)
+        return True
+    return place.is_file() and place.suffix.lower() in _BAGS
 
 
 def unpack(
@@ -183,9 +201,22 @@ def check_calibration(folder: Path, max_pixels: int) -> None:
     """
     path = folder / "intrinsics.json"
     if path.is_file():
-        camera = read_calibration(path).camera
-        _check_pixels((camera.width, camera.height), max_pixels)
-        camera.check_plausible()
+        check_camera_file(path, max_pixels)
+
+
+def check_camera_file(path: Path, max_pixels: int) -> None:
+    """Check a file of intrinsics before anything is allocated.
+
+    Raises:
+        CameraError: the file is damaged, or its values cannot be those of a camera.
+        TooLargeError: the file is long, or images have too many pixels.
+    """
+    if path.stat().st_size > _MAX_DOCUMENT:
+        hint = "write intrinsics alone"
+        raise TooLargeError(f"{path.name} has more than {_MAX_DOCUMENT} bytes.", field="camera", hint=hint)
+    camera = read_calibration(path).camera
+    _check_pixels((camera.width, camera.height), max_pixels)
+    camera.check_plausible()
 
 
 def checked_image(data: bytes, max_pixels: int, field: str) -> bytes:

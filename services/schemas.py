@@ -241,7 +241,9 @@ class MapRequest(Request):
 
     id: str = Field(description="its name in URLs: a-z, 0-9, - and _")
     log: str | None = Field(
-        None, description="synthetic:SCENE?..., or a folder, .mcap or .bag under one of the service's log roots"
+        None,
+        description="synthetic:SCENE?..., or a folder, .mcap, .bag or rig of several cameras (.yaml) under one of the "
+        "service's log roots",
     )
     camera: str | None = Field(None, description="preset of intrinsics (tum_fr1, ...) instead of the log's own")
     max_frames: Annotated[int, Field(ge=1)] | None = Field(None, description="read no more than these")

@@ -18,7 +18,9 @@ from starlette.responses import FileResponse
 from splatbot.config import Config, with_cameras
 from splatbot.errors import InputError
 from splatbot.formats import WRITTEN, save_gaussians
+from splatbot.layouts import log_kind
 from splatbot.logs import Log, open_log
+from splatbot.logs.rig import RigLog
 from splatbot.protocols import Array
 from splatbot.services.arms import known_robot
 from splatbot.services.codecs import ZIP, answer, answers, body_of, request_body
@@ -36,7 +38,7 @@ from splatbot.services.dependencies import (
 )
 from splatbot.services.heap import trim_heap
 from splatbot.services.library import check_id
-from splatbot.services.mapping import check_length, map_recording, map_upload, workspace_of
+from splatbot.services.mapping import check_length, map_recording, map_upload, open_rig, workspace_of
 from splatbot.services.problems import MapNotReadyError, TooLargeError
 from splatbot.services.recordings import allowed_log
 from splatbot.services.robot_mask import RobotMask
@@ -146,7 +148,7 @@ def create_map(
     )
     log, mask = _open_masked(query, uri)
     total = check_length(log, limits.max_frames, query.max_frames)
-    workspace = _scene(query, uri, base)
+    workspace = _scene(query, log.parts[0].log.uri if isinstance(log, RigLog) else uri, base)
     served = service.store.add(
         query.id, source=log.name, state="mapping", workspace=workspace, mask=mask, awaited=False, owner=caller
     )
@@ -337,9 +339,13 @@ def _open_masked(query: MapRequest, uri: str) -> tuple[Log, RobotMask | None]:
     """Open a recording, with the mask of the robot that the request and the recording's scene.yaml describe."""
     if query.robot is None:
         return open_log(uri, camera=query.camera), None
+    robot = known_robot(query.robot.name)
+    if query.camera is None and log_kind(uri) == "rig":
+        rig, further = open_rig(uri, query.robot.workspace)
+        return rig, RobotMask(robot, further.pop(""), further=further, log=rig)
     workspace = query.robot.workspace(None if uri.startswith("synthetic:") else find_workspace(uri))
     log = open_log(uri, camera=query.camera, joint_delay=workspace.joint_delay)
-    return log, RobotMask(known_robot(query.robot.name), workspace, log=log)
+    return log, RobotMask(robot, workspace, log=log)
 
 
 def _mask_of_stream(service: Service, query: MapRequest) -> RobotMask | None:

@@ -144,10 +144,11 @@ class _UniqueKeys(yaml.SafeLoader):
         Raises:
             yaml.YAMLError: a key is repeated.
         """
-        keys = [key.value for key, _ in node.value]
-        for key in keys:
-            if keys.count(key) > 1:
+        known: set[str] = set()
+        for key in (str(key.value) for key, _ in node.value):
+            if key in known:
                 raise yaml.constructor.ConstructorError(None, None, f"the key {key!r:.40} is repeated", node.start_mark)
+            known.add(key)
         return super().construct_mapping(node, deep)
 
 
@@ -159,7 +160,7 @@ def rig_entries(file: Path) -> dict[str, dict[str, Any]]:
     """
     try:
         found = yaml.load(file.read_text(encoding="utf-8"), Loader=_UniqueKeys)
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:  # ValueError: no UTF-8, or no date
         raise LogError(f"is no YAML file: {error}.", file=file, hint=_HINT) from error
     cameras = found.get("cameras") if isinstance(found, dict) else None
     if not isinstance(cameras, dict) or not 1 <= len(cameras) <= MAX_CAMERAS:
