@@ -41,6 +41,7 @@ OPTIONS: tuple[dict[str, Any], ...] = (
     {"strategy": "absgrad", "background": "random"},
     {"strategy": "mcmc", "background": "random"},
     {"strategy": "fixed", "keep_surfaces": True},
+    {"strategy": "default", "surfels": True},
 )
 
 SETTINGS = TrainingSettings(Path(), 1, 8, TrainingOptions(batch=2))

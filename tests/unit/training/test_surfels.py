@@ -19,7 +19,7 @@ from splatbot.optimize.adam import PARAMETERS
 from splatbot.training.folder import TrainingFolder, TrainingSettings
 from splatbot.training.images import ImageCache
 from splatbot.training.initialize import initial_model
-from splatbot.training.options import TrainingOptions
+from splatbot.training.options import USUAL, TrainingOptions
 from splatbot.training.scoring import score_held_out, summary
 from splatbot.training.session import TrainingSession
 from splatbot.training.trainer import Trainer
@@ -122,6 +122,12 @@ def test_no_surfel_and_surfels_out_of_view_are_trained_without_error() -> None:
 def test_options_that_surfels_cannot_have_are_refused(options: dict[str, Any]) -> None:
     with pytest.raises(InputError, match=r"surfels|normal_weight"):
         TrainingOptions(surfels=True, **options)
+
+
+def test_surfels_do_not_replace_the_map_of_a_run() -> None:
+    usual: dict[str, Any] = {"iterations": 1, **USUAL["run"]}
+    assert TrainingOptions(**usual).keeps_frame
+    assert not TrainingOptions(**usual, surfels=True).keeps_frame
 
 
 def test_a_resumed_training_of_surfels_has_the_map_of_one_that_was_not_stopped(tmp_path: Path) -> None:
