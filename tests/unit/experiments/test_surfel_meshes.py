@@ -9,7 +9,7 @@ from experiments.surfel_meshes import main, measure, seen_points, true_surface
 from splatbot.evaluation.surface import score_mesh
 from splatbot.logs.synthetic import SyntheticLog
 
-LOG = "synthetic:tabletop?frames=24&width=160&height=120&arc=100"
+LOG = "synthetic:tabletop?frames=16&width=160&height=120&arc=100"
 
 
 def test_the_points_that_views_see_lie_on_the_true_surface() -> None:
@@ -25,7 +25,7 @@ def test_the_points_that_views_see_lie_on_the_true_surface() -> None:
 def test_meshes_of_surfels_are_more_accurate_and_more_complete_than_those_of_gaussians(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    found = {m.kind: m for m in measure(LOG, 500, 2500, ["depth"])}
+    found = {m.kind: m for m in measure(LOG, 300, 2000, ["depth"])}
     gaussians, surfels = found["gaussians"], found["surfels"]
     print(gaussians, surfels, sep="\n")
     assert surfels.score.accuracy_m < 0.85 * gaussians.score.accuracy_m
