@@ -223,3 +223,17 @@ def test_a_robot_that_cannot_be_masked_makes_no_map(robot: dict[str, Any], messa
             client.create_map("robot", robot=robot)
         assert error.value.status == 422
         assert client.maps() == []
+
+
+def test_a_pushed_frame_whose_depth_is_later_needs_the_joints_at_both_times() -> None:
+    log = static_log(0.6)
+    late = replace(log[0], depth=log[1].depth, depth_delay=0.1)
+    with serving() as service:
+        client = client_of(service)
+        client.create_map("late", robot=STATIC)
+        with pytest.raises(ServiceError, match="missing or stale") as refused:
+            client.push("late", late)
+        assert refused.value.status == 409
+        client.push("late", replace(log[1], depth=log[2].depth, depth_delay=0.1, depth_joints=log.joints[2]))
+        assert client.map("late")["robot"]["masked"] == 1
+        client.end("late")
