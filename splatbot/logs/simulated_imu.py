@@ -15,7 +15,7 @@ GRAVITY = np.array([0.0, 0.0, 9.81])  # [m/s²] specific force of a camera at re
 
 @dataclass(frozen=True)
 class SimulatedImuConstants:
-    """Errors of the simulated sensor, those of a BMI270 by its data sheet (revision 1.6)."""
+    """Errors of the simulated sensor, those of a BMI270 by its data sheet."""
 
     gyro_noise: float = 1.2e-4
     """White noise [rad/s/√Hz]."""
