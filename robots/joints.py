@@ -62,6 +62,17 @@ def suspect_degrees(q: Array, chain: KinematicChain, field: str) -> None:
     raise InputError(f"joint {k} is {q[k]:g}, its limits are {limits}: degrees?", field=field, hint=hint)
 
 
+def suspect_degrees_in_rows(q: Array, chain: KinematicChain, field: str) -> None:
+    """Check each row of joint values (C, J), as :func:`suspect_degrees` does; the error names the row.
+
+    Raises:
+        InputError: a row is in degrees.
+    """
+    if q.ndim == 2 and q.shape[1] == len(chain.upper):
+        for row in np.flatnonzero((np.abs(q) > 2 * np.pi).any(axis=1)):
+            suspect_degrees(q[row], chain, f"{field}[{row}]")
+
+
 def check_limits(q: Array, chain: KinematicChain, field: str) -> None:
     """Check that joint values (J,) [rad or m] are within the limits, as plans do for their ends.
 

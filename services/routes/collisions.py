@@ -7,6 +7,7 @@ from typing import Annotated, Any
 import numpy as np
 from fastapi import APIRouter, Depends, Request, Response
 
+from splatbot.robots.joints import suspect_degrees_in_rows
 from splatbot.services.codecs import answer, answers, body_of, request_body
 from splatbot.services.dependencies import ServedAfterFrames, Settings, problems
 from splatbot.services.problems import TooLargeError
@@ -59,7 +60,8 @@ def collisions(request: Request, served: ServedAfterFrames, settings: Settings, 
     if len(query.q) > settings.max_configurations:
         hint = "split the request, or raise SPLATBOT_MAX_CONFIGURATIONS"
         raise TooLargeError(f"has more than {settings.max_configurations} rows.", field="q", hint=hint)
-    _, arm = arm_in(served, query.robot, query.base, query.margin, query.opening)
+    model, arm = arm_in(served, query.robot, query.base, query.margin, query.opening)
+    suspect_degrees_in_rows(query.q, model.chain, "q")
     tiled = None
     if served.tiles is not None:
         room = float(arm.spheres.radii.max()) + arm.margin

@@ -46,17 +46,21 @@ def audit(
     check_camera(camera)
 
     from splatbot.atomic import atomic_write
+    from splatbot.cli.progress import steps
     from splatbot.report.audit import audit_png
     from splatbot.results.audit import audit_run
     from splatbot.results.folder import RunFolder
     from splatbot.robots.in_view import reopen_log
 
     folder = RunFolder(run)
-    found = audit_run(folder, reopen_log(folder, uri=log, camera=camera), n_sigma=n_sigma)
-    summary = found.summary()
-    folder.save_audit(summary)
-    with atomic_write(run / "audit.png") as file:
-        file.write(audit_png(found))
+    with steps() as tell:
+        tell("comparing the map with measured depth")
+        found = audit_run(folder, reopen_log(folder, uri=log, camera=camera), n_sigma=n_sigma)
+        summary = found.summary()
+        folder.save_audit(summary)
+        tell("drawing audit.png")
+        with atomic_write(run / "audit.png") as file:
+            file.write(audit_png(found))
     if as_json:
         print(json.dumps(summary, indent=2, allow_nan=False))
     else:

@@ -85,19 +85,24 @@ def export(
         raise InputError(f"is {voxel:g} m.", field="--voxel", hint="give 0.001 to 1")
 
     from splatbot.atomic import replace_files
+    from splatbot.cli.progress import steps
     from splatbot.map_export import MapExport
     from splatbot.results.units import megabytes
 
-    exported = MapExport.open(file, voxel=voxel, n_sigma=n_sigma)
     writers: dict[str, Callable[[Path], None]] = {}
-    for name in formats or tuple(_FILES):
-        try:
-            writers |= _writers(exported, name, None if mesh_from == "auto" else mesh_from)
-        except InputError as error:
-            if formats:
-                raise
-            print(f"left out {_FILES[name]}: {error}")
-    replace_files(folder, writers)
+    with steps() as tell:
+        tell("reading the map")
+        exported = MapExport.open(file, voxel=voxel, n_sigma=n_sigma)
+        for name in formats or tuple(_FILES):
+            tell(f"making {_FILES[name]}")
+            try:
+                writers |= _writers(exported, name, None if mesh_from == "auto" else mesh_from)
+            except InputError as error:
+                if formats:
+                    raise
+                print(f"left out {_FILES[name]}: {error}")
+        tell("writing")
+        replace_files(folder, writers)
     for note in exported.notes:
         print(f"note: {note}")
     for written in writers:

@@ -147,10 +147,11 @@ def _candidate(place: Workspace) -> str:
 
 def _rows(found: Workspace) -> list[tuple[str, str]]:
     T = found.T_world_base
+    proposed = "; only proposed: move it to where yours stands, --base-offset X Y Z" if found.base_proposed else ""
     return [
         ("gravity", _text(found.gravity)),
         ("support plane n, d [m]", _text(found.support_plane)),
-        ("base at [m]", _text(None if T is None else T[:3, 3])),
+        ("base at [m]", _text(None if T is None else T[:3, 3]) + proposed),
         ("base's x, z", _text(None if T is None else T[:3, [0, 2]].T)),
         ("workspace, from the base [m]", _text(found.box)),
     ]

@@ -179,9 +179,10 @@ def grasp(
     if failure is not None and not verbose:
         reason, change = failure
         why = " ".join(note for note in found.notes if note.startswith("took "))
-        raise SplatbotError(f"cannot be grasped: {reason}. {why}".strip(), field=found.label, hint=change)
+        what = f"{found.label} ({_place(found, scene)})"
+        raise SplatbotError(f"cannot be grasped by {arm.name}: {reason}. {why}".strip(), field=what, hint=change)
     result.unwrap()
-    _print(result, scene, folder, margin_text, verbose=verbose)
+    _print(arm.name, result, scene, folder, margin_text, verbose=verbose)
     if not hand_only:
         print_command(f"splatbot plan-pick --map {map} --grasp {folder / 'grasp.json'} --start home")
     return 0
@@ -317,7 +318,7 @@ def _place(target: Target, scene: SegmentedMap) -> str:
     return f"{size}at {place_words((points.min(axis=0) + points.max(axis=0)) / 2)}"
 
 
-def _print(result: GraspResult, scene: SegmentedMap, folder: Path, margin: str, *, verbose: bool) -> None:
+def _print(robot: str, result: GraspResult, scene: SegmentedMap, folder: Path, margin: str, *, verbose: bool) -> None:
     from rich.table import Table
 
     from splatbot.cli.tables import print_columns, print_table, print_text
@@ -327,6 +328,7 @@ def _print(result: GraspResult, scene: SegmentedMap, folder: Path, margin: str, 
     seconds = sum(result.seconds.values())
     rows = [
         ("target", f"{taken}; {_place(target, scene)}"),
+        ("robot", robot),
         ("candidates", f"{result.candidates} hands in {1e3 * seconds:.0f} ms"),
         *(("note", note) for note in (*target.notes, *result.notes)),
         ("margin", margin),

@@ -298,6 +298,7 @@ def _print_summary(result: RunResult) -> None:
         ("time per frame", f"median {milliseconds(ms['p50'])}, 95 % {milliseconds(ms['p95'])}"),
         *(("question", doubt) for doubt in run_doubts(m)),
         *([("report", str(result.folder / "report.html"))] if (result.folder / "report.html").exists() else []),
+        *([("to go on", f"splatbot map --resume {result.folder}")] if m["cut"] == "mapping" else []),
     ]
     print_table(rows, title=f"{m['log']['name']}: {_ending(m)}")
 

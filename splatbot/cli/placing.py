@@ -19,18 +19,25 @@ if TYPE_CHECKING:
 
 Pose = tuple[float, float, float, float, float, float, float]
 
+_FARTHEST = 100.0  # [m]
+_LARGEST_MARGIN = 1.0  # [m]
+
 
 def checked_pose(pose: Pose, flag: str) -> NDArray[np.float64]:
     """Return the pose (4, 4) of a position and a quaternion wxyz.
 
     Raises:
-        InputError: the quaternion is no rotation.
+        InputError: the quaternion is no rotation, or the position is farther than 100 m, as in millimetres.
     """
     import numpy as np
 
     from splatbot.errors import InputError
     from splatbot.geometry import pose_from_quat
 
+    if not max(map(abs, pose[:3])) <= _FARTHEST:
+        where = " ".join(f"{x:g}" for x in pose[:3])
+        hint = f"give metres: {' '.join(f'{x / 1e3:g}' for x in pose[:3])}"
+        raise InputError(f"is at {where} m: millimetres?", field=flag, hint=hint)
     try:
         return np.asarray(pose_from_quat(pose[:3], pose[3:]))
     except ValueError as error:
@@ -84,6 +91,14 @@ def base_pose(pose: Pose | None, map_: Path) -> NDArray[np.float64]:
         hint = "give --base, or write a scene.yaml: splatbot info MAP --fit-plane estimates one"
         raise InputError("is not known.", file=map_, field="base", hint=hint)
     return known.T_world_base
+
+
+def is_base_proposed(pose: Pose | None, map_: Path) -> bool:
+    """Return whether the base is the one that `splatbot info --fit-plane` proposed, and not that of a real robot."""
+    from splatbot.workspace import find_workspace
+
+    known = find_workspace(map_)
+    return pose is None and known is not None and known.base_proposed
 
 
 def base_words(pose: Pose | None) -> str:
@@ -196,7 +211,7 @@ def margin_value(text: str) -> float:
     """Parse a margin [m].
 
     Raises:
-        InputError: it is no number, or below 0.
+        InputError: it is no number, below 0, or above 1 m, as in millimetres.
     """
     import math
 
@@ -208,4 +223,7 @@ def margin_value(text: str) -> float:
         value = -1.0
     if not 0.0 <= value < math.inf:
         raise InputError(f"is {text!r}.", field="--margin", hint='give metres, 0 or more, or "auto"')
+    if value > _LARGEST_MARGIN:
+        hint = f"give metres, at most {_LARGEST_MARGIN:g}: {value / 1e3:g}"
+        raise InputError(f"is {value:g} m: millimetres?", field="--margin", hint=hint)
     return value

@@ -15,6 +15,7 @@ from splatbot.cli.placing import (
     base_pose,
     base_words,
     checked_pose,
+    is_base_proposed,
     joint_values,
     map_obstacles,
     margin_value,
@@ -113,6 +114,10 @@ def plan(
     named = named_robot(robot)
     for words, flag in ((start, "--start"), (goal or ("home",), "--goal")):
         joint_values(words, named, flag)
+    if goal_pose is not None:
+        checked_pose(goal_pose, "--goal-pose")
+    if margin not in (None, "auto"):
+        margin_value(margin)
 
     import numpy as np
 
@@ -166,37 +171,40 @@ def plan(
     if result.path is None:
         _draw_refusal(folder / "refused.png", model, around, arm, found.planner, result, here, wanted)
     around.check(result)
+    proposed = is_base_proposed(base, map)
     try:
         result.unwrap()
     except PlanningError as refused:
-        scene = find_workspace(map)
-        if result.status is PlanStatus.START_STATE_IN_COLLISION and base is None and scene and scene.base_proposed:
+        if result.status is PlanStatus.START_STATE_IN_COLLISION and proposed:
             correct = f"splatbot info {map} --fit-plane --base-offset X Y Z"
             refused.hint = f"{refused.hint}; or correct the base, which is only proposed: {correct}"
         raise
     assert trajectory is not None
     covers = found.scope(around, confidence=confidence)
+    covers["base_proposed"] = proposed
     nearest = closest_approach(found.planner.arm, found.planner.field, trajectory, around.kind)
     title = f"{arm.name} in {map.resolve().name}"
-    texts = {
-        "plan.json": json.dumps(
-            _summary(arm, T_world_base, result, trajectory)
-            | {"nearest": None if nearest is None else nearest.to_dict(), "covers": covers},
-            indent=2,
-        ),
-        "trajectory.json": trajectory.to_json(),
-        "trajectory.csv": trajectory.to_csv(),
-        "plan.html": plan_html(
-            model, found.planner.arm, found.planner.field, trajectory, coarse_appearance(arm), arm.fk, title=title
-        ),
-    }
-    writers = {name: write_text(text) for name, text in texts.items()}
-    of_arm = (appearance(arm), arm.fk, arm.T_link_tcp)
-    eye = None if seen_from is None else np.array(seen_from)
-    picture = plan_png(model, found.planner.arm, trajectory, *of_arm, nearest=nearest, seen_from=eye)
-    replace_files(folder, writers | {"plan.png": write_bytes(picture)})
-    (folder / "refused.png").unlink(missing_ok=True)  # of an earlier plan
-    _print(result, trajectory, covers, nearest, folder)
+    with steps() as tell:
+        tell("drawing plan.html and plan.png")
+        texts = {
+            "plan.json": json.dumps(
+                _summary(arm, T_world_base, result, trajectory)
+                | {"nearest": None if nearest is None else nearest.to_dict(), "covers": covers},
+                indent=2,
+            ),
+            "trajectory.json": trajectory.to_json(),
+            "trajectory.csv": trajectory.to_csv(),
+            "plan.html": plan_html(
+                model, found.planner.arm, found.planner.field, trajectory, coarse_appearance(arm), arm.fk, title=title
+            ),
+        }
+        writers = {name: write_text(text) for name, text in texts.items()}
+        of_arm = (appearance(arm), arm.fk, arm.T_link_tcp)
+        eye = None if seen_from is None else np.array(seen_from)
+        picture = plan_png(model, found.planner.arm, trajectory, *of_arm, nearest=nearest, seen_from=eye)
+        replace_files(folder, writers | {"plan.png": write_bytes(picture)})
+        (folder / "refused.png").unlink(missing_ok=True)  # of an earlier plan
+    _print(arm.name, result, trajectory, covers, nearest, folder)
     if grasp is not None:
         print_text("the approach to the grasp is not part of this plan; see `splatbot plan-pick` for the whole pick")
     of_plan = f"--map {map} --robot {robot}{base_words(base)} --trajectory {folder / 'trajectory.json'}"
@@ -295,6 +303,9 @@ def _summary(
 
 
 _BASE_IN_MAP = "NOT COVERED, AND PROBABLY WRONG: more of the mounted link than its foot is in the map; check --base"
+_BASE_PROPOSED = (
+    "NOT COVERED, AND ONLY PROPOSED: measure where the robot stands; info --fit-plane --base-offset moves it"
+)
 _BASE = "not covered: the mounted link is not checked, and an error of its pose moves the whole arm"
 _LONG_DETOUR = 2.0
 _DETOUR = "{:.1f} times the direct distance in joint space; a longer --budget-ms may shorten it"
@@ -311,6 +322,7 @@ _UNKNOWN = {
 
 
 def _print(
+    robot: str,
     result: PlanResult,
     trajectory: JointTrajectory,
     covers: dict[str, Any],
@@ -323,6 +335,7 @@ def _print(
     assert result.path is not None
     c = trajectory.certificate
     rows = [
+        ("robot", robot),
         ("first path after", f"{1e3 * result.first_seconds:.2f} ms"),
         ("length", f"{result.path.cost:.3f} rad, {len(result.path)} waypoints"),
         *([("detour", _DETOUR.format(detour))] if (detour := _detour(result.path)) > _LONG_DETOUR else []),
@@ -332,7 +345,7 @@ def _print(
         *([] if nearest is None else [("nearest", str(nearest))]),
         *([("close", _CLOSE)] if nearest is not None and nearest.close else []),
         ("covers", f"moving links against the map at {covers['n_sigma']:g} sigma and against the arm itself"),
-        ("base", _BASE_IN_MAP if covers["base_in_map"] else _BASE),
+        ("base", _BASE_IN_MAP if covers["base_in_map"] else _BASE_PROPOSED if covers["base_proposed"] else _BASE),
         (
             "hand",
             "covered, with the gripper fully open"

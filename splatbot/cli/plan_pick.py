@@ -11,7 +11,7 @@ import tyro
 from splatbot.cli.drawing import CAMERA, draw_offscreen, film
 from splatbot.cli.grasp import graspable_objects
 from splatbot.cli.paths import check_file, check_output
-from splatbot.cli.placing import Pose, agree_with_plans, joint_values, pose_values, robot_of_grasps
+from splatbot.cli.placing import Pose, agree_with_plans, is_base_proposed, joint_values, pose_values, robot_of_grasps
 from splatbot.errors import SplatbotError
 from splatbot.layouts import map_file
 
@@ -109,7 +109,8 @@ def plan_pick(
                 on_step=lambda step: tell(f"simulating the pick: {step.stage} is done"), watch=watch,
             )  # fmt: skip
     folder = out if out is not None else Path("runs") / "pick"
-    texts = {"pick.json": json.dumps(_summary(picked, known), indent=2)}
+    proposed = is_base_proposed(_base(map, known), map)
+    texts = {"pick.json": json.dumps(_summary(picked, known) | {"base_proposed": proposed}, indent=2)}
     for name, motion in zip(_names(picked), picked.result.motions, strict=True):
         texts[name] = motion.trajectory.to_json()
     title = f"{known.target.label} in {map.resolve().name}"
@@ -119,7 +120,7 @@ def plan_pick(
     for path in folder.glob("[0-9]-*.json"):
         if path.name not in texts:  # a motion of an earlier pick must not follow these
             path.unlink()
-    _print(picked, known, folder)
+    _print(picked, known, folder, proposed=proposed)
     if not picked:
         first = picked.problems[0].split("; ")[0].rstrip(".")  # the table has all of them
         raise SplatbotError(f"should not be executed: {first}.", field="pick", hint=_HINT)
@@ -204,7 +205,7 @@ def _verdict(picked: MapPick) -> str:
     return "; ".join(picked.problems)
 
 
-def _print(picked: MapPick, known: GraspFile, folder: Path) -> None:
+def _print(picked: MapPick, known: GraspFile, folder: Path, *, proposed: bool) -> None:
     from splatbot.cli.tables import print_table, print_text
     from splatbot.planning.timing import clearance_text
 
@@ -215,6 +216,8 @@ def _print(picked: MapPick, known: GraspFile, folder: Path) -> None:
         clearance = clearance_text(motion.trajectory.certificate)
         rows.append((name.removesuffix(".json"), f"{length}, {opening}, clearance {clearance}"))
     rows.append(("margin", f"{1e3 * known.arm_margin:.1f} mm before the hand, {1e3 * known.margin:.1f} mm at the hand"))
+    if proposed:
+        rows.append(("base", "only proposed: measure where the robot stands; info --fit-plane --base-offset moves it"))
     rows.append(("verdict", _verdict(picked) if result else str(result.outcome)))  # a row above has the reason
     if near.part:
         where = f"{picked.words(near.part)} and {near.other} at {near.time:.1f} s"

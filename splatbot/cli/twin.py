@@ -226,7 +226,7 @@ def _print(result: TwinResult, entries: list[LedgerEntry], written: list[Path]) 
     console = Console(width=None if sys.stdout.isatty() else 140)
     console.print(
         f"{result.scene}: {result.duration:.2f} s in {result.steps} steps of {1e3 * result.timestep:g} ms, "
-        f"{result.real_time:.1f} times faster than real time"
+        f"{_pace(result.real_time)}"
     )
     for note in result.notes:
         console.print(f"  {note}")
@@ -257,6 +257,13 @@ def _print(result: TwinResult, entries: list[LedgerEntry], written: list[Path]) 
     print_columns(table, console)
     for path in written:
         console.print(f"written to {path}")
+
+
+def _pace(real_time: float) -> str:
+    """Return words for simulated seconds in each second."""
+    if real_time >= 1.0:
+        return f"{real_time:.1f} times faster than real time"
+    return f"{1 / max(real_time, 1e-9):.1f} times slower than real time"
 
 
 def _print_lists() -> None:

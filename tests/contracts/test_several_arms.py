@@ -78,3 +78,11 @@ def test_joints_of_the_other_arm_are_refused(service: Service) -> None:
     answer = service.client.post("/v1/maps/b/collisions", json={"robot": UR, "q": [panda().home.tolist()]})
     assert answer.status_code == 422
     assert "q" in answer.json()["detail"]
+
+
+def test_configurations_in_degrees_are_refused_with_their_row(service: Service) -> None:
+    body = {"robot": UR, "q": [home(UR), [0, -90, 90, -90, -90, 0]]}
+    answer = service.client.post("/v1/maps/b/collisions", json=body)
+    assert answer.status_code == 422
+    assert "q[1]" in answer.text
+    assert "degrees?" in answer.text

@@ -82,6 +82,20 @@ def test_a_file_that_is_no_json_and_two_goals_are_refused(run: RunCommand, map_f
     assert_refused(run(*words), "must be given, one of them")
 
 
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        (("--goal-pose", 450, 0, 250, 0, 1, 0, 0), "give metres: 0.45 0 0.25"),
+        (("--goal", *GOAL, "--margin", 5), "give metres, at most 1: 0.005"),
+    ],
+)
+def test_millimetres_are_suspected_before_the_map_is_read(
+    run: RunCommand, map_file: Path, words: tuple[Any, ...], why: str
+) -> None:
+    map_file.write_bytes(b"no map")
+    assert_refused(run("plan", "--map", map_file, *BASE, "--start", "home", *words), why)
+
+
 @pytest.mark.parametrize("proposed", [True, False])
 def test_a_start_in_collision_names_the_correction_of_a_base_that_is_only_proposed(
     run: RunCommand, map_file: Path, tmp_path: Path, proposed: bool
@@ -125,6 +139,7 @@ def test_a_certified_trajectory_is_written_with_its_pictures(run: RunCommand, ma
     assert summary["joint_names"] == [f"panda_joint{k}" for k in range(1, 8)]
     assert summary["T_world_base"] == {"translation": [0, 0, 0], "quaternion_wxyz": [1, 0, 0, 0]}
     assert (summary["covers"]["base_in_map"], summary["covers"]["hand"]) == (False, True)
+    assert not summary["covers"]["base_proposed"]
     message = json.loads((out / "trajectory.json").read_text())
     np.testing.assert_allclose(message["points"][0]["positions"], panda().home, atol=1e-9)
     np.testing.assert_allclose(message["points"][-1]["positions"], GOAL, atol=1e-9)
