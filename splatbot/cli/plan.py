@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -373,7 +374,9 @@ def _margin_text(covers: dict[str, Any]) -> str:
         return {"user": "as given", "none": "0, so that errors of the map are not covered"}[covers["margin_from"]]
     margin, error = (f"{1e3 * covers[name]:.1f} mm" for name in ("margin_m", "region_error_m"))
     larger = f"; the margin of {margin} is that of the points near start and goal, or near an earlier path"
-    return (
-        f"audited: {100 * covers['confidence']:g} % of {covers['region_points']} measured points near the motion are "
-        f"within {error} of the map{larger if margin != error else ''}"
-    )
+    share, points = f"{100 * covers['confidence']:g} %", covers["region_points"]
+    if points <= math.ceil(1.0 / max(1.0 - covers["confidence"], 1e-12)):  # the largest error of them
+        which = f"the {points} measured points nearest to the motion, of which few are within 20 cm,"
+    else:
+        which = f"{share} of {points} measured points near the motion"
+    return f"audited: {which} are within {error} of the map{larger if margin != error else ''}"

@@ -235,3 +235,5 @@ def test_two_numbers_of_a_margin_have_a_reason_and_equal_ones_are_printed_once()
     text = _margin_text(covers | {"margin_m": 0.0036})
     assert "within 3.3 mm of the map; the margin of 3.6 mm is that of the points near start and goal" in text
     assert _margin_text(covers | {"margin_m": 0.0033}).endswith("within 3.3 mm of the map")
+    few = _margin_text(covers | {"margin_m": 0.0033, "region_points": 1000, "confidence": 0.999})
+    assert few.startswith("audited: the 1000 measured points nearest to the motion")
