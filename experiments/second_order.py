@@ -202,7 +202,7 @@ def run(scene: Scene, step: Step, seconds: float) -> tuple[list[float], int]:
         step(model, spent / seconds)
         spent += time.process_time() - begin
         steps += 1
-        while spent >= seconds * (len(scores) + 1) / 4:
+        while len(scores) < 4 and spent >= seconds * (len(scores) + 1) / 4:
             scores.append(scene.psnr(model))
     return scores, steps
 

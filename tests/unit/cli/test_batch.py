@@ -116,7 +116,7 @@ def test_variables_that_results_depend_on_are_recorded_and_keys_are_not(
 
 
 def test_ctrl_c_at_a_terminal_keeps_finished_items_and_leaves_no_process(tmp_path: Path) -> None:
-    words = ["batch", "simulate", "wall", "tabletop", "--out", str(tmp_path), "--workers", "1"]
+    words = ["batch", "simulate", "wall", "tabletop", "room", "--out", str(tmp_path), "--workers", "1"]
     options = ["--with", "size", "320x240", "--with", "frames", "60"]
     shown = at_a_terminal(*words, *options, columns=80, interrupt_at="wall: finished")
     assert shown.code == 130, shown.text
@@ -125,7 +125,8 @@ def test_ctrl_c_at_a_terminal_keeps_finished_items_and_leaves_no_process(tmp_pat
     assert item_processes(tmp_path) == []
     values = json.loads((tmp_path / "batch.json").read_text())
     assert values["interrupted"]
-    assert [row["state"] for row in values["items"]] == ["finished", "unfinished"]
+    states = [row["state"] for row in values["items"]]
+    assert (states[0], states[-1]) == ("finished", "unfinished")  # a busy machine may finish the second one
 
 
 def test_sigint_to_the_program_alone_ends_its_items(tmp_path: Path) -> None:
