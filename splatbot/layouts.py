@@ -290,7 +290,8 @@ def _foreign_folder(folder: Path) -> tuple[str, str]:
         return "holds a rosbag2 without metadata.yaml", "run `ros2 bag reindex`, or name the .mcap file itself"
     inside = sorted(path.name for path in folder.iterdir() if log_layout(path)) if folder.is_dir() else []
     if inside:
-        return "holds no log of a known layout itself", f"name one of the logs in it: {', '.join(inside[:4])}"
+        more = f" and {len(inside) - 4} more" if len(inside) > 4 else ""
+        return "holds no log of a known layout itself", f"name one of the logs in it: {', '.join(inside[:4])}{more}"
     return "holds no log of a known layout", _LAYOUTS_HINT
 
 
