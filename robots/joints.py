@@ -65,11 +65,14 @@ def suspect_degrees(q: Array, chain: KinematicChain, field: str) -> None:
 def suspect_degrees_in_rows(q: Array, chain: KinematicChain, field: str) -> None:
     """Check each row of joint values (C, J), as :func:`suspect_degrees` does; the error names the row.
 
+    One joint between one and two turns is no reason: joints without limits count their turns.
+
     Raises:
         InputError: a row is in degrees.
     """
     if q.ndim == 2 and q.shape[1] == len(chain.upper):
-        for row in np.flatnonzero((np.abs(q) > 2 * np.pi).any(axis=1)):
+        turns = np.abs(q) / (2 * np.pi)
+        for row in np.flatnonzero((turns > 2).any(axis=1) | ((turns > 1).sum(axis=1) > 1)):
             suspect_degrees(q[row], chain, f"{field}[{row}]")
 
 

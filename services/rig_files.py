@@ -9,7 +9,7 @@ from typing import Any
 import yaml
 
 from splatbot.errors import LogError
-from splatbot.layouts import is_camera
+from splatbot.layouts import is_camera, log_kind
 from splatbot.logs.listed import local_address
 from splatbot.logs.presets import PRESETS
 from splatbot.logs.rig import rig_entries
@@ -42,7 +42,9 @@ def check_rig(
         CameraError: a file of intrinsics is damaged.
     """
     _check_text(file)
-    for name, values in rig_entries(file).items():
+    if log_kind(file) != "rig":  # the readers of other kinds take places that are not checked here
+        raise LogError("is no rig.", file=file, field="log", hint="write `cameras: {NAME: {log: FOLDER}}`")
+    for name, values in _entries(file).items():
         where = f"cameras.{name}"
         if is_camera(values["log"]):
             hint = "name recordings; `splatbot map RIG` maps live cameras"
@@ -51,10 +53,19 @@ def check_rig(
             raise LogError("is no recording that may be mapped.", file=file, field=f"{where}.log", hint=_ELSEWHERE)
         camera = values.get("camera")
         if camera and (camera not in PRESETS or (file.parent / camera).exists()):
-            if not _is_allowed(file, camera, roots, Path.is_file):
+            if "?" in camera or not _is_allowed(file, camera, roots, Path.is_file):
                 hint = f"{_ELSEWHERE}, or a preset: {', '.join(PRESETS)}"
                 raise LogError("is no camera file that may be read.", file=file, field=f"{where}.camera", hint=hint)
             check_camera(Path(local_address(file, camera)))
+
+
+def _entries(file: Path) -> dict[str, Any]:
+    try:
+        return dict(rig_entries(file))
+    except LogError:
+        raise
+    except ValueError as error:  # Python prints no integer of more than 4,300 digits
+        raise LogError("has a number of too many digits.", file=file, field="log", hint="correct the file") from error
 
 
 def _check_text(file: Path) -> None:

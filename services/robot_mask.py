@@ -202,9 +202,7 @@ class RobotMask:
             if links is not None:
                 masked = links.mask(self._mask_of(frame), frame)
             elif live and not knows_joints(frame):
-                masked = self._masked_at(frame, 0.0)
-                if abs(frame.depth_delay) > SAME_TIME_S:
-                    masked = self._masked_at(masked, frame.depth_delay)
+                masked = self._masked_live(frame)
             else:
                 masked = self._mask_of(frame)(frame)
         except JointsUnknownError as error:
@@ -228,6 +226,21 @@ class RobotMask:
                 hint="describe it by T_link_camera and camera_link",
             )
         return found
+
+    def _masked_live(self, frame: Frame) -> Frame:
+        """Return the frame masked at both times; its own joints count at that of colour."""
+        if frame.joints is None:
+            masked = self._masked_at(frame, 0.0)
+        else:
+            masked = self._mask_of(frame).at_joints(frame, frame.joints, frame.joint_names)
+        if abs(frame.depth_delay) <= SAME_TIME_S:
+            return masked
+        try:
+            return self._masked_at(masked, frame.depth_delay)
+        except JointsUnknownError as error:
+            if frame.joints is not None:
+                error.hint = f"give depth_joints, the joints at the time of depth; or {error.hint}"
+            raise
 
     def _masked_at(self, frame: Frame, after: float) -> Frame:
         """Return the frame with the robot masked as it is at a time [s] after the frame's stamp."""

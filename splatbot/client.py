@@ -230,6 +230,7 @@ class Client(AbstractContextManager["Client"]):
     def push(self, map_id: str, frame: Frame) -> TrackedFrame:
         """Send a frame of any camera for tracking and mapping; wait while too many frames are in progress."""
         c = frame.camera
+        joints, names, depth_joints = _known_joints(frame)
         body = {
             "stamp": frame.stamp,
             "camera": {n: getattr(c, n) for n in ("fx", "fy", "cx", "cy", "width", "height")},
@@ -237,10 +238,10 @@ class Client(AbstractContextManager["Client"]):
             "depth": frame.depth,
             "mask": frame.mask,
             "depth_delay": frame.depth_delay,
-            "joints": None if frame.joints is None else frame.joints.tolist(),
-            "joint_names": list(frame.joint_names),
+            "joints": joints,
+            "joint_names": names,
             "camera_name": frame.camera_name,
-            "depth_joints": None if frame.depth_joints is None else frame.depth_joints.tolist(),
+            "depth_joints": depth_joints,
         }
         answer = self._packed("POST", _map_path(map_id, "frames"), body)
         return _result(TrackedFrame, answer)
@@ -488,6 +489,17 @@ def _loopback(host: str) -> bool:
         return host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:
         return False
+
+
+def _known_joints(frame: Frame) -> tuple[list[float] | None, list[str], list[float] | None]:
+    """Return joints, names and joints at the time of depth, without named joints that one of both times lacks."""
+    if frame.joints is None or frame.depth_joints is None:
+        return None if frame.joints is None else frame.joints.tolist(), list(frame.joint_names), None
+    names, joints, later = list(frame.joint_names), frame.joints.tolist(), frame.depth_joints.tolist()
+    if not names:
+        return joints, names, later
+    known = [k for k, values in enumerate(zip(joints, later, strict=True)) if np.isfinite(values).all()]
+    return [joints[k] for k in known], [names[k] for k in known], [later[k] for k in known]
 
 
 def _map_path(map_id: str, *rest: str) -> str:

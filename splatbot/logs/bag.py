@@ -187,6 +187,19 @@ class BagLog(StampedLog):
         except InputError as error:
             raise LogError(error.message, file=where, field=error.field, hint=error.hint) from error
 
+    @cached_property
+    def _imu_messages(self) -> RecordedImu:
+        """The Imu messages, which are read when the first frame needs them; none if one is damaged."""
+        found = RecordedImu()
+        try:
+            for topic in sorted({c.topic for c in self._reader.connections if c.msgtype == IMU}):
+                for message in self._all(topic):
+                    found.add(topic, message)
+        except LogError as error:
+            _log.warning("the Imu messages are not used: %s", error)
+            return RecordedImu()
+        return found
+
     def _imu_samples(self, index: int) -> ImuSamples | None:
         """Return the samples since the frame before, or those shortly before the first frame."""
         if self.imu is None:
@@ -209,8 +222,8 @@ class BagLog(StampedLog):
         same_size = color_of(colors).shape[:2] == depth_of(depths).shape
         if self._given.get("registered") == "1":
             return cameras.pair("", "", same_size=True)
-        topic = _info_of(self._depth)
-        if (info := next(iter(self._all(topic)), None)) is not None:
+        topic, of_color = _info_of(self._depth), same_size and color_frame == depth_frame
+        if not of_color and (info := next(iter(self._all(topic)), None)) is not None:
             cameras.set_depth(self._checked(topic, lambda: camera_of(info)), info.header.frame_id.strip("/"))
         try:
             pair = cameras.pair(color_frame, depth_frame, same_size=same_size)
@@ -222,7 +235,9 @@ class BagLog(StampedLog):
         return pair
 
     def _static_transform(self, target: str, source: str) -> Array | None:
-        return static_transform(self.transforms(), target, source)
+        messages = self._all(TF_STATIC) if TF_STATIC in self._reader.topics else ()
+        found = (transform for message in messages for transform in transforms_of(message, static=True))
+        return static_transform(found, target, source)
 
     @cached_property
     def _joints(self) -> JointStates:
@@ -299,17 +314,13 @@ class BagLog(StampedLog):
         raise LogError(f"holds {problem}.", file=self.path, field=key, hint=hint)
 
     def _scan(self) -> dict[str, list[_Entry]]:
-        """Index the images by topic, sorted by stamp, of which only headers are parsed, and read the Imu messages."""
+        """Index the images by topic, sorted by stamp, of which only headers are parsed."""
         images = (self._color, self._depth, MASK)
-        wanted = [c for c in self._reader.connections if c.topic in images or c.msgtype == IMU]
-        self._imu_messages = RecordedImu()
+        wanted = [c for c in self._reader.connections if c.topic in images]
         found: dict[str, list[_Entry]] = defaultdict(list)
         seen: dict[tuple[str, int], int] = defaultdict(int)
         try:
             for connection, received, raw in self._reader.messages(wanted):
-                if connection.msgtype == IMU:
-                    self._imu_messages.add(connection.topic, self._reader.deserialize(raw, connection.msgtype))
-                    continue
                 key = connection.topic, received
                 stamp = header_stamp(raw, ros2=self._reader.is2)
                 found[connection.topic].append(_Entry(stamp, received, seen[key]))

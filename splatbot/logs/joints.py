@@ -13,7 +13,7 @@ from splatbot.errors import InputError, LogError
 
 NAME = "joints.txt"
 _HEADER = "# stamp"
-HOLD = 0.02  # [s] before the first line and after the last one, in which an arm at 1 m/s moves by 2 cm
+HOLD = 0.02  # [s] from a line, in which an arm at 1 m/s moves by 2 cm
 MAX_GAP = 0.1  # [s] to the neighbouring lines beyond which joint positions are not interpolated
 
 
@@ -58,9 +58,9 @@ class JointRecord:
         self.names = _names(path, lines, self.joints.shape[1])
 
     def at(self, stamp: float) -> NDArray[np.float64] | None:
-        """Interpolate the positions (J,) [rad] at a stamp [s]; None if a neighbouring line is more than 0.1 s away.
+        """Interpolate the positions (J,) [rad] at a stamp [s] between lines that are at most 0.1 s away.
 
-        Before the first line and after the last one, positions are known for 0.02 s.
+        Within 0.02 s of a line without such a neighbour, its positions hold. Otherwise they are not known: None.
         """
         return interpolate_joints(self.stamps, self.joints, stamp)
 
@@ -182,10 +182,9 @@ def interpolate_joints(
     after = int(np.searchsorted(stamps, stamp))
     near = slice(max(after - 1, 0), after + 1)
     gaps = np.abs(stamps[near] - stamp)
-    allowed = MAX_GAP if len(gaps) == 2 else HOLD
-    if gaps.min() > 0 and gaps.max() > allowed:
-        return None
-    return np.array([np.interp(stamp, stamps[near], column) for column in joints[near].T])
+    if len(gaps) == 2 and gaps.max() <= MAX_GAP:
+        return np.array([np.interp(stamp, stamps[near], column) for column in joints[near].T])
+    return joints[near][int(gaps.argmin())].copy() if gaps.min() <= HOLD else None
 
 
 def find_joints(folder: Path) -> JointRecord | None:

@@ -146,7 +146,7 @@ def write_frame(out: McapFile, frame: Frame) -> None:
         out.write(MASK, image_message(frame.stamp, frame.mask), at)
     if frame.joints is not None:
         out.write(JOINTS, joint_state_message(frame.stamp, frame.joints, frame.joint_names), at)
-    if frame.depth_joints is not None:
+    if frame.depth_joints is not None and frame.depth_delay:
         known = [k for k, q in enumerate(frame.depth_joints.tolist()) if math.isfinite(q)]
         names = tuple(frame.joint_names[k] for k in known if frame.joint_names)
         later = joint_state_message(frame.stamp + frame.depth_delay, frame.depth_joints[known], names)

@@ -44,6 +44,8 @@ class GyroscopeConstants:
     """Largest number of samples between two tracked frames, which bounds the work."""
     saturated: float = 4.0
     """Angular rate [rad/s] from which two equal successive values are the end of the sensor's range."""
+    max_rate: float = 100.0
+    """Largest angular rate [rad/s] of a sample that can be true; sensors end at 35 to 70 rad/s."""
     gate: float = 21.11
     """99.99 % quantile of χ² with 3 degrees of freedom."""
     moving: float = 0.03
@@ -182,11 +184,11 @@ def integrate(
         trust: trust in the gyroscope, for the result.
 
     Returns:
-        The rotation, or None if there is a gap, if rates are saturated or if there are too many samples.
+        The rotation, or None if there is a gap, if rates are saturated or absurd, or if there are too many samples.
     """
     p, (start, stop) = CONSTANTS, interval
     near = samples[(samples[:, 0] > start - p.max_gap) & (samples[:, 0] < stop + p.max_gap)]
-    if not 0 < len(near) <= p.max_samples or _is_saturated(near[:, 1:]):
+    if not 0 < len(near) <= p.max_samples or np.abs(near[:, 1:]).max() > p.max_rate or _is_saturated(near[:, 1:]):
         return None
     stamps = near[:, 0]
     times = np.concatenate([[start], stamps[(stamps > start) & (stamps < stop)], [stop]])

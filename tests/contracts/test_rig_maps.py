@@ -97,6 +97,13 @@ REFUSED: dict[str, tuple[str, int, str]] = {
     "a folder outside": ("cameras: {a: {log: ../secret/table}}", 422, NONE),
     "a folder outside by its whole path": ("cameras: {a: {log: SECRET}}", 422, NONE),
     "a folder outside by a link": ("cameras: {a: {log: linked}}", 422, NONE),
+    "a list beside cameras in quotes": ('"cameras": {a: {log: wrist}}\nrecordings: [{log: SECRET}]', 422, "is no rig"),
+    "a camera file with options": (
+        "cameras: {a: {log: wrist, camera: 'huge.json?x'}}",
+        422,
+        "no camera file that may be",
+    ),
+    "a number of 5000 digits": (f"cameras: {{a: {{log: wrist, time_offset: 0x{'f' * 5000}}}}}", 422, "digits"),
     "a folder that is not there": ("cameras: {a: {log: ../secret/nothing}}", 422, NONE),
     "a folder of the service": ("cameras: {a: {log: tests}}", 422, NONE),
     "a list that leads out": ("cameras: {a: {log: leaky}}", 422, "leads out of the recording"),
@@ -117,7 +124,7 @@ REFUSED: dict[str, tuple[str, int, str]] = {
     "many keys": ("cameras: {" + ", ".join(f"c{k}: 1" for k in range(6000)) + "}", 422, "more than 8"),
     "no YAML": ("cameras: {a: {log: wrist", 422, "is no YAML in line 1"),
     "a day that is not": ("cameras: {a: {log: 2001-99-99}}", 422, "is no YAML file"),
-    "no list of cameras": ("recordings: [{log: wrist}]", 422, "lists no cameras"),
+    "no list of cameras": ("recordings: [{log: wrist}]", 422, "is no rig"),
     "nine cameras": ("cameras: {" + ", ".join(f"c{k}: {{log: wrist}}" for k in range(9)) + "}", 422, "more than 8"),
     "an unknown setting": ("cameras: {a: {log: wrist}, b: {log: wrist, T_world_camra: 1}}", 422, "T_world_camra"),
 }

@@ -32,6 +32,13 @@ def test_joints_are_linear_in_between_and_unknown_far_from_any_line(tmp_path: Pa
         assert joints.at(stamp) is None
 
 
+def test_positions_hold_for_20_ms_from_a_line_also_at_6_hz(tmp_path: Path) -> None:
+    joints = written(tmp_path, "1.000 0.0\n1.167 0.1\n1.333 0.2\n")
+    for stamp, expected in ((1.167, 0.1), (1.185, 0.1), (1.149, 0.1)):
+        np.testing.assert_allclose(joints.at(stamp), [expected])  # type: ignore[arg-type]
+    assert joints.at(1.19) is None
+
+
 @pytest.mark.parametrize(
     ("text", "line", "message"),
     [

@@ -21,3 +21,4 @@ def test_the_row_in_degrees_is_named_with_its_values_in_radians() -> None:
 def test_a_whole_turn_of_a_joint_is_no_degree() -> None:
     chain = load_robot("ur5e").chain
     suspect_degrees_in_rows(np.full((3, 6), 2 * np.pi), chain, "q")
+    suspect_degrees_in_rows(np.array([[0, -1.57, 1.57, -1.57, -1.57, 7.0]]), chain, "q")

@@ -98,8 +98,9 @@ def test_the_bias_is_found_and_its_stated_error_is_honest() -> None:
         rows() + np.array([5.0, 0, 0, 0]),  # another clock
         np.minimum(3 * rows(), [np.inf, np.inf, 4.36, np.inf]),  # the range of 250 °/s is exceeded
         np.column_stack([np.linspace(0, 0.05, 5000), np.zeros((5000, 3))]),
+        rows() * [1, 1e200, 1, 1],
     ],
-    ids=["none", "slow", "gap", "late", "early", "clock", "saturated", "many"],
+    ids=["none", "slow", "gap", "late", "early", "clock", "saturated", "many", "absurd"],
 )
 def test_samples_that_do_not_determine_the_rotation_give_none(samples: Array) -> None:
     assert Gyroscope().measure(ImuSamples.of(samples), 0.0, 0.05) is None
