@@ -115,7 +115,7 @@ class JointHistory:
             joints = np.array(self._positions[max(after - 1, 0) : after + 1])
             newest = self._stamps[-1] if self._stamps else None
         between = len(stamps) > 0 and stamps[0] <= stamp <= stamps[-1]
-        found = interpolate_joints(stamps, joints, stamp) if between else None
+        found = interpolate_joints(stamps, joints, stamp, hold=0.0) if between else None
         if found is None:
             known = "no joint state has come" if newest is None else f"the newest is {stamp - newest:+.3f} s before it"
             hint = f"publish joint states with the images, with stamps of their clock, at {1 / MAX_GAP:.0f} Hz or more"

@@ -176,15 +176,21 @@ def _are_numbers(names: Sequence[str]) -> bool:
 
 
 def interpolate_joints(
-    stamps: NDArray[np.float64], joints: NDArray[np.float64], stamp: float
+    stamps: NDArray[np.float64], joints: NDArray[np.float64], stamp: float, *, hold: float = HOLD
 ) -> NDArray[np.float64] | None:
-    """Interpolate joint positions (N, J) [rad] at stamps (N,) [s] to one stamp; see :meth:`JointRecord.at`."""
+    """Interpolate joint positions (N, J) [rad] at stamps (N,) [s] to one stamp; see :meth:`JointRecord.at`.
+
+    Args:
+        stamps, joints: the lines.
+        stamp: the time [s].
+        hold: [s] distance from a line within which its positions hold, where two lines are not near enough.
+    """
     after = int(np.searchsorted(stamps, stamp))
     near = slice(max(after - 1, 0), after + 1)
     gaps = np.abs(stamps[near] - stamp)
     if len(gaps) == 2 and gaps.max() <= MAX_GAP:
         return np.array([np.interp(stamp, stamps[near], column) for column in joints[near].T])
-    return joints[near][int(gaps.argmin())].copy() if gaps.min() <= HOLD else None
+    return joints[near][int(gaps.argmin())].copy() if gaps.min() <= hold else None
 
 
 def find_joints(folder: Path) -> JointRecord | None:
