@@ -39,15 +39,12 @@ serve: $(INSTALL_STAMP) ## HTTP service on a map (MAP=file.ply HOST=127.0.0.1 PO
 	$(BIN)/splatbot serve --map $(MAP) --host $(HOST) --port $(PORT)
 
 .PHONY: test
-# Files of tests run beside each other, the long ones (e2e) first; each process keeps to one thread. There is one process
-# more than cores, up to 4, because tests of controllers and services wait.
-CORES := $(shell env -u OMP_NUM_THREADS nproc 2>/dev/null || getconf _NPROCESSORS_ONLN)
-test: WORKERS := $(shell expr $(CORES) + 1)
+# Files of tests run beside each other, one for each core, the long ones (e2e) first; each process keeps to one thread.
 test: export OMP_NUM_THREADS := 1
 # Compiled files are kept: each process would compile the tests and their asserts again.
 test test-long: export PYTHONDONTWRITEBYTECODE :=
-test: $(INSTALL_STAMP) ## the test suite without its long part (13 minutes on 2 cores)
-	$(BIN)/python -m pytest -m "not long" --numprocesses $(WORKERS) --maxprocesses 4 --dist loadfile --no-loadscope-reorder $(PYTEST_ARGS)
+test: $(INSTALL_STAMP) ## the test suite without its long part (14 minutes on 2 cores)
+	$(BIN)/python -m pytest -m "not long" --numprocesses auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder $(PYTEST_ARGS)
 
 .PHONY: test-long
 # Long tests run beside each other as those of `make test` do; those that measure time or use all cores follow alone.
