@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from splatbot.cli.placing import PROPOSED_BASE
 from splatbot.cli.tables import print_table, print_text
 
 if TYPE_CHECKING:
@@ -147,7 +148,7 @@ def _candidate(place: Workspace) -> str:
 
 def _rows(found: Workspace) -> list[tuple[str, str]]:
     T = found.T_world_base
-    proposed = "; only proposed: move it to where yours stands, --base-offset X Y Z" if found.base_proposed else ""
+    proposed = f"; {PROPOSED_BASE}" if found.base_proposed else ""
     return [
         ("gravity", _text(found.gravity)),
         ("support plane n, d [m]", _text(found.support_plane)),

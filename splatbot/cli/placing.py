@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 Pose = tuple[float, float, float, float, float, float, float]
 
+PROPOSED_BASE = "only proposed: measure where the robot stands; info --fit-plane --base-offset X Y Z moves it"
+"""Words for a base that no robot confirms, see :func:`is_base_proposed`."""
 _FARTHEST = 100.0  # [m]
 _LARGEST_MARGIN = 1.0  # [m]
 

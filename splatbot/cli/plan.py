@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -12,6 +11,7 @@ import tyro
 
 from splatbot.cli.paths import check_file, check_output
 from splatbot.cli.placing import (
+    PROPOSED_BASE,
     Pose,
     base_pose,
     base_words,
@@ -181,8 +181,7 @@ def plan(
             refused.hint = f"{refused.hint}; or correct the base, which is only proposed: {correct}"
         raise
     assert trajectory is not None
-    covers = found.scope(around, confidence=confidence)
-    covers["base_proposed"] = proposed
+    covers = found.scope(around, confidence=confidence) | {"base_proposed": proposed}
     nearest = closest_approach(found.planner.arm, found.planner.field, trajectory, around.kind)
     title = f"{arm.name} in {map.resolve().name}"
     with steps() as tell:
@@ -304,9 +303,6 @@ def _summary(
 
 
 _BASE_IN_MAP = "NOT COVERED, AND PROBABLY WRONG: more of the mounted link than its foot is in the map; check --base"
-_BASE_PROPOSED = (
-    "NOT COVERED, AND ONLY PROPOSED: measure where the robot stands; info --fit-plane --base-offset moves it"
-)
 _BASE = "not covered: the mounted link is not checked, and an error of its pose moves the whole arm"
 _LONG_DETOUR = 2.0
 _DETOUR = "{:.1f} times the direct distance in joint space; a longer --budget-ms may shorten it"
@@ -346,7 +342,14 @@ def _print(
         *([] if nearest is None else [("nearest", str(nearest))]),
         *([("close", _CLOSE)] if nearest is not None and nearest.close else []),
         ("covers", f"moving links against the map at {covers['n_sigma']:g} sigma and against the arm itself"),
-        ("base", _BASE_IN_MAP if covers["base_in_map"] else _BASE_PROPOSED if covers["base_proposed"] else _BASE),
+        (
+            "base",
+            _BASE_IN_MAP
+            if covers["base_in_map"]
+            else f"NOT COVERED, AND {PROPOSED_BASE}"
+            if covers["base_proposed"]
+            else _BASE,
+        ),
         (
             "hand",
             "covered, with the gripper fully open"
@@ -370,12 +373,14 @@ def _detour(path: JointPath) -> float:
 
 
 def _margin_text(covers: dict[str, Any]) -> str:
+    from splatbot.results.margin import least_points
+
     if covers["margin_from"] != "audit":
         return {"user": "as given", "none": "0, so that errors of the map are not covered"}[covers["margin_from"]]
     margin, error = (f"{1e3 * covers[name]:.1f} mm" for name in ("margin_m", "region_error_m"))
     larger = f"; the margin of {margin} is that of the points near start and goal, or near an earlier path"
     share, points = f"{100 * covers['confidence']:g} %", covers["region_points"]
-    if points <= math.ceil(1.0 / max(1.0 - covers["confidence"], 1e-12)):  # the largest error of them
+    if points <= least_points(covers["confidence"]):  # the region had fewer
         which = f"the {points} measured points nearest to the motion, of which few are within 20 cm,"
     else:
         which = f"{share} of {points} measured points near the motion"

@@ -11,7 +11,15 @@ import tyro
 from splatbot.cli.drawing import CAMERA, draw_offscreen, film
 from splatbot.cli.grasp import graspable_objects
 from splatbot.cli.paths import check_file, check_output
-from splatbot.cli.placing import Pose, agree_with_plans, is_base_proposed, joint_values, pose_values, robot_of_grasps
+from splatbot.cli.placing import (
+    PROPOSED_BASE,
+    Pose,
+    agree_with_plans,
+    is_base_proposed,
+    joint_values,
+    pose_values,
+    robot_of_grasps,
+)
 from splatbot.errors import SplatbotError
 from splatbot.layouts import map_file
 
@@ -217,7 +225,7 @@ def _print(picked: MapPick, known: GraspFile, folder: Path, *, proposed: bool) -
         rows.append((name.removesuffix(".json"), f"{length}, {opening}, clearance {clearance}"))
     rows.append(("margin", f"{1e3 * known.arm_margin:.1f} mm before the hand, {1e3 * known.margin:.1f} mm at the hand"))
     if proposed:
-        rows.append(("base", "only proposed: measure where the robot stands; info --fit-plane --base-offset moves it"))
+        rows.append(("base", PROPOSED_BASE))
     rows.append(("verdict", _verdict(picked) if result else str(result.outcome)))  # a row above has the reason
     if near.part:
         where = f"{picked.words(near.part)} and {near.other} at {near.time:.1f} s"

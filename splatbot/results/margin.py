@@ -42,6 +42,11 @@ class RunMarginConstants:
 CONSTANTS = RunMarginConstants()
 
 
+def least_points(confidence: float) -> int:
+    """Return the number of points of which one may exceed a quantile ``confidence`` (0..1) of their errors."""
+    return int(np.ceil(1.0 / max(1.0 - confidence, 1e-12)))
+
+
 @dataclass(frozen=True, eq=False)
 class AuditedError:
     """Distances of confirmed surface points from the ellipsoids of a map.
@@ -79,8 +84,7 @@ class AuditedError:
 
     def in_region(self, centers: ArrayLike, confidence: float = CONSTANTS.confidence) -> AuditedError:
         """Return the points near the ``centers`` (C, 3) [m, world], at least as many as the confidence (0..1) needs."""
-        least = min(len(self), int(np.ceil(1.0 / max(1.0 - confidence, 1e-12))))
-        return self.near(centers, CONSTANTS.region, least)
+        return self.near(centers, CONSTANTS.region, min(len(self), least_points(confidence)))
 
     def quantile(self, confidence: float) -> float:
         """Return an error [m] that a fraction ``confidence`` (0..1) of the points does not exceed; 0 without points.

@@ -112,7 +112,7 @@ REFUSED: dict[str, tuple[str, int, str]] = {
     "half a character": ('cameras: {a: {log: "wrist\\uD800"}}', 422, ""),
     "a long name": (f"cameras: {{a: {{log: {'a' * 5000}}}}}", 422, NONE),
     "a camera file outside": (
-        "cameras: {a: {log: wrist, camera: /etc/passwd}}",
+        "cameras: {a: {log: wrist, camera: SECRET/intrinsics.json}}",
         422,
         "no camera file that may be read",
     ),
