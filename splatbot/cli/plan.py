@@ -302,8 +302,6 @@ def _summary(
     }
 
 
-_BASE_IN_MAP = "NOT COVERED, AND PROBABLY WRONG: more of the mounted link than its foot is in the map; check --base"
-_BASE = "not covered: the mounted link is not checked, and an error of its pose moves the whole arm"
 _LONG_DETOUR = 2.0
 _DETOUR = "{:.1f} times the direct distance in joint space; a longer --budget-ms may shorten it"
 _CLOSE = "less than 2 mm beyond the margin; a larger --margin keeps the arm farther away"
@@ -342,14 +340,7 @@ def _print(
         *([] if nearest is None else [("nearest", str(nearest))]),
         *([("close", _CLOSE)] if nearest is not None and nearest.close else []),
         ("covers", f"moving links against the map at {covers['n_sigma']:g} sigma and against the arm itself"),
-        (
-            "base",
-            _BASE_IN_MAP
-            if covers["base_in_map"]
-            else f"NOT COVERED, AND {PROPOSED_BASE}"
-            if covers["base_proposed"]
-            else _BASE,
-        ),
+        ("base", _base_text(covers)),
         (
             "hand",
             "covered, with the gripper fully open"
@@ -370,6 +361,14 @@ def _detour(path: JointPath) -> float:
 
     direct = float(np.linalg.norm(path.waypoints[-1] - path.waypoints[0]))
     return path.cost / direct if direct > 0.0 else 1.0
+
+
+def _base_text(covers: dict[str, Any]) -> str:
+    if covers["base_in_map"]:
+        return "NOT COVERED, AND PROBABLY WRONG: more of the mounted link than its foot is in the map; check --base"
+    if covers["base_proposed"]:
+        return f"NOT COVERED, AND {PROPOSED_BASE}"
+    return "not covered: the mounted link is not checked, and an error of its pose moves the whole arm"
 
 
 def _margin_text(covers: dict[str, Any]) -> str:
