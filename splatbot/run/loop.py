@@ -121,15 +121,17 @@ class FrameLoop:
             KeyboardInterrupt: A signal arrived during the wait for a frame, or a callback raised it.
         """
         interrupts.when_requested = self.source.end
+        exhausted = False
         with closing(iter(self.source)) as arrivals:
-            while interrupts.requested is None:
+            while interrupts.requested is None and not exhausted:
                 with interrupts.interruptible(after=1):  # a camera may be silent for long
                     arrival = next(arrivals, None)
-                if arrival is None:
-                    return True
-                if not self._step(arrival):
+                exhausted = arrival is None
+                if arrival is not None and not self._step(arrival):
                     return False
-        return self.source.live and interrupts.end_of_camera()
+        if self.source.live and interrupts.requested is not None:  # the signal may be why there is no next frame
+            return interrupts.end_of_camera()
+        return exhausted
 
     def _step(self, arrival: Arrival) -> bool:
         """Process one frame; False when the run ends here."""
