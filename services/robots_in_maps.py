@@ -31,6 +31,11 @@ def base_in(served: ServedMap, given: Pose | None) -> NDArray[np.float64]:
     return known
 
 
+def is_base_proposed(served: ServedMap, given: Pose | None) -> bool:
+    """Return whether :func:`base_in` is the proposal of `splatbot info --fit-plane`, and not that of a real robot."""
+    return given is None and served.workspace is not None and served.workspace.base_proposed
+
+
 def robot_in(served: ServedMap, robot: str) -> RobotModel:
     """Return a robot by name, with the joint offsets of the scene of a map.
 

@@ -17,7 +17,7 @@ from splatbot.services.margins import margin_source, plan_with_margin
 from splatbot.services.plan_obstacles import check_unknown, plan_obstacles
 from splatbot.services.plans import Plan
 from splatbot.services.problems import TooLargeError
-from splatbot.services.robots_in_maps import arm_in, base_in, joints_of, robot_in
+from splatbot.services.robots_in_maps import arm_in, base_in, is_base_proposed, joints_of, robot_in
 from splatbot.services.schemas import BASE_EXAMPLE, IkRequest, PlanRequest
 from splatbot.services.topics import PLAN
 
@@ -45,6 +45,7 @@ _ANSWER = {
         "n_sigma": 2.0,
         "self_collision": True,
         "base": False,
+        "base_proposed": False,
         "support_plane": True,
         "unknown_space": "free",
         "region_points": 5831,
@@ -111,7 +112,8 @@ def plan(request: Request, served: ServedAfterFrames, service: Service, query: _
             field="rate",
             hint=hint,
         )
-    covers = found.scope(around, confidence=query.confidence)
+    proposed = is_base_proposed(served, query.base)
+    covers = found.scope(around, confidence=query.confidence) | {"base_proposed": proposed}
     kept = service.plans.add(served, robot.name, base, result, trajectory, source.why, covers)
     service.store.tell(served, PLAN, trajectory)
     return answer(request, _description(kept, query.rate))

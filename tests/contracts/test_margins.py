@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +48,8 @@ def service(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterato
     store.add("table", source="table", state="static", snapshot=state, run=RunFolder(recorded))
     far = Workspace(T_world_base=np.array([[1.0, 0, 0, 0], [0, 1, 0, 30], [0, 0, 1, 0], [0, 0, 0, 1]]))
     store.add("placed", source="table", state="static", snapshot=state, run=RunFolder(recorded), workspace=far)
+    proposed = replace(far, base_proposed=True)
+    store.add("proposed", source="table", state="static", snapshot=state, run=RunFolder(recorded), workspace=proposed)
     store.add("lost", source="lost", state="static", snapshot=state, run=RunFolder(lost))
     store.add("wall", source="wall.ply", state="static", snapshot=wall())
     store.add("bare", source="wall.ply", state="static", snapshot=wall(), workspace=far)
@@ -82,6 +85,15 @@ def test_a_given_margin_is_kept_and_stated(service: Service) -> None:
     assert (answer["covers"]["margin_from"], answer["covers"]["region_points"]) == ("user", None)
     zero = plan(service, "table", margin=0).json()
     assert (zero["margin_m"], zero["margin_source"]) == (0.0, "given")
+
+
+def test_a_plan_says_whether_its_base_is_only_proposed(service: Service) -> None:
+    answer = plan(service, "proposed", margin=0, base=None).json()
+    assert answer["covers"]["base_proposed"] is True
+    again = service.client.get(f"/v1/plans/{answer['id']}").json()
+    assert again["covers"]["base_proposed"] is True
+    assert plan(service, "proposed", margin=0).json()["covers"]["base_proposed"] is False  # the request gives one
+    assert plan(service, "placed", margin=0, base=None).json()["covers"]["base_proposed"] is False
 
 
 def test_unknown_space_is_an_obstacle_where_it_is_asked_for(service: Service) -> None:
