@@ -2,20 +2,34 @@
 
 from __future__ import annotations
 
-import time
+from collections.abc import Callable
+from types import SimpleNamespace
 
 import pytest
 
 from splatbot.services.leases import LeaseError, Leases
 
 
-def test_one_owner_at_a_time_and_the_next_after_the_lease_ends() -> None:
+@pytest.fixture
+def let_pass(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
+    """Stops the clock of leases, and returns a function that advances it by a time [s]."""
+    now = [100.0]
+    monkeypatch.setattr("splatbot.services.leases.time", SimpleNamespace(monotonic=lambda: now[0]))
+
+    def advance(seconds: float) -> None:
+        now[0] += seconds
+
+    return advance
+
+
+def test_one_owner_at_a_time_and_the_next_after_the_lease_ends(let_pass: Callable[[float], None]) -> None:
     leases = Leases()
     first = leases.acquire("fake", "a", seconds=0.05)
     with pytest.raises(LeaseError, match="another client"):
         leases.acquire("fake", "b", seconds=1.0)
+    let_pass(0.04)
     assert leases.holds(first.id)
-    time.sleep(0.06)
+    let_pass(0.02)
     assert not leases.holds(first.id)
     second = leases.acquire("fake", "b", seconds=1.0)
     with pytest.raises(LeaseError, match="has ended"):
@@ -23,11 +37,11 @@ def test_one_owner_at_a_time_and_the_next_after_the_lease_ends() -> None:
     assert leases.check(second.id, "fake").owner == "b"
 
 
-def test_a_renewed_lease_lasts() -> None:
+def test_a_renewed_lease_lasts(let_pass: Callable[[float], None]) -> None:
     leases = Leases()
     lease = leases.acquire("fake", "a", seconds=0.1)
     for _ in range(5):
-        time.sleep(0.05)
+        let_pass(0.05)
         leases.renew(lease.id)
     assert leases.holds(lease.id)
     leases.release(lease.id)
