@@ -12,23 +12,27 @@ import pytest
 from splatbot.errors import DeviceError, InputError
 from splatbot.logs import open_log
 from splatbot.protocols import FrameSource
-from splatbot.robots.cameras import ReplayCamera, open_camera
+from splatbot.robots.cameras import ReplayCamera, open_camera, replay
 from splatbot.robots.cameras.replay import ReplayOptions
 from tests.conftest import MakeLog
+
+
+@pytest.fixture
+def all_buffered(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Has cameras buffer all frames, so that a busy machine, whose reader is slow, loses none."""
+    monkeypatch.setattr(replay, "_QUEUE", 1000)
 
 
 def test_frames_come_no_earlier_than_their_stamps_say(make_log: MakeLog) -> None:
     camera = open_camera(f"replay:{make_log(4, period=0.1)}?speed=2")
     assert isinstance(camera, FrameSource)
-    begun: float | None = None
-    arrived = []
-    for frame in camera:
-        begun = begun or time.monotonic()
-        arrived.append((frame.index, time.monotonic() - begun))
+    begun = time.monotonic()
+    arrived = [(frame.index, time.monotonic() - begun) for frame in camera]
     assert [index for index, _ in arrived] == [0, 1, 2, 3]
-    assert all(at >= 0.05 * index - 0.02 for index, at in arrived)
+    assert all(at >= 0.05 * index for index, at in arrived)
 
 
+@pytest.mark.usefixtures("all_buffered")
 def test_frames_are_the_recording_s(make_log: MakeLog) -> None:
     log = open_log(make_log())
     for a, b in zip(log, ReplayCamera(log), strict=True):
@@ -37,6 +41,7 @@ def test_frames_are_the_recording_s(make_log: MakeLog) -> None:
         np.testing.assert_array_equal(a.depth, b.depth)
 
 
+@pytest.mark.usefixtures("all_buffered")
 def test_a_loop_goes_on_with_increasing_stamps(make_log: MakeLog) -> None:
     camera = ReplayCamera(open_log(make_log(3)), ReplayOptions(loop=True))
     stamps = [frame.stamp for frame in islice(camera, 7)]
@@ -58,14 +63,17 @@ def test_a_slow_reader_loses_the_oldest_frames(make_log: MakeLog) -> None:
 
 def test_a_stall_delays_what_follows_and_loses_nothing(make_log: MakeLog) -> None:
     camera = ReplayCamera(open_log(make_log(4)), ReplayOptions(speed=10, stall=2, stall_s=0.3))
-    times = [time.monotonic() for _ in camera]
+    begun = time.monotonic()
+    times = [time.monotonic() - begun for _ in camera]
     assert len(times) == 4
-    assert times[2] - times[1] >= 0.25
+    assert times[2] >= 0.3
 
 
+@pytest.mark.usefixtures("all_buffered")
 def test_dropped_and_broken_frames_are_the_same_each_time(make_log: MakeLog) -> None:
     log = open_log(make_log(30))
-    played = [list(ReplayCamera(log, ReplayOptions(drop=0.3, corrupt=0.3))) for _ in range(2)]
+    options = ReplayOptions(drop=0.3, corrupt=0.3, speed=100)
+    played = [list(ReplayCamera(log, options)) for _ in range(2)]
     indices = [[frame.index for frame in frames] for frames in played]
     assert indices[0] == indices[1]
     assert 10 < len(indices[0]) < 30
@@ -85,9 +93,12 @@ def test_a_device_that_is_unplugged_raises_after_the_frames_before(make_log: Mak
 
 def test_closing_ends_a_wait_for_a_frame(make_log: MakeLog) -> None:
     camera = ReplayCamera(open_log(make_log()), ReplayOptions(stall=1, stall_s=60))
-    threading.Timer(0.2, camera.close).start()
     begun = time.monotonic()
-    assert len(list(camera)) == 1
+    taken = []
+    for frame in camera:
+        taken.append(frame.index)
+        threading.Timer(0.2, camera.close).start()  # during the wait for the second frame
+    assert taken == [0]
     assert time.monotonic() - begun < 30
 
 
