@@ -144,7 +144,8 @@ def test_stopping_ends_after_the_frame_in_work() -> None:
     log = _Log()
     log.hold.clear()
     store, mapping = _follow(log)
-    threading.Timer(0.1, log.hold.set).start()
+    mapping.stop(timeout_s=0.0)  # while it waits for the first frame
+    log.hold.set()
     mapping.stop(timeout_s=10)
     assert mapping.wait(0)
     assert store.get("live").map_version <= 1
