@@ -23,7 +23,8 @@ class Interrupts:
     def __init__(self) -> None:
         self.requested: int | None = None
         self.when_requested: Callable[[], None] | None = None  # as the end of a camera that delivers no frame
-        self._count = 0
+        self._arrived: list[int] = []
+        self._settled = 0  # of them, which are no longer pending
         self._raises_after: int | None = None
         self._previous: dict[signal.Signals, Any] = {}
 
@@ -56,19 +57,22 @@ class Interrupts:
 
     def end_of_camera(self) -> bool:
         """Return whether the only request is Ctrl-C, the normal end of a camera; it is then no longer pending."""
-        ended = self.requested == signal.SIGINT and self._count <= 1
-        if ended:
-            self.requested, self._count = None, 0
-        return ended
+        seen = len(self._arrived)
+        if self.requested != signal.SIGINT or seen > 1:
+            return False
+        self.requested, self._settled = None, seen
+        if len(self._arrived) > seen:  # one came meanwhile
+            self.requested = self.requested or self._arrived[seen]
+        return self.requested is None
 
     def _handle(self, number: int, _frame: FrameType | None) -> None:
-        self._count += 1
+        self._arrived.append(number)
         self.requested = self.requested or number
         if self.when_requested is not None:
             self.when_requested()
         self._raise_if_requested()
 
     def _raise_if_requested(self) -> None:
-        if self._raises_after is not None and self._count > self._raises_after:
+        if self._raises_after is not None and len(self._arrived) - self._settled > self._raises_after:
             self._raises_after = None  # the next signal must not interrupt the cleanup
             raise KeyboardInterrupt

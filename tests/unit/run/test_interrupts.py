@@ -77,6 +77,42 @@ def test_after_the_block_and_while_it_is_left_a_signal_is_a_request_again() -> N
     assert reached == ["cleaned up"]
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("late", [False, True])
+def test_a_signal_in_the_moment_in_which_ctrl_c_ends_a_camera_is_not_lost(number: int, late: bool) -> None:
+    class Signalled(Interrupts):
+        """A second signal arrives just before or after the first one counts no longer."""
+
+        def __setattr__(self, name: str, value: object) -> None:
+            settled = name == "requested" and value is None and vars(self).get(name) is not None
+            if settled and not late:
+                send(number)
+            super().__setattr__(name, value)
+            if settled and late:
+                send(number)
+
+    with Signalled() as interrupts:
+        send()
+        assert not interrupts.end_of_camera()
+        assert interrupts.requested == number
+        with pytest.raises(KeyboardInterrupt), interrupts.interruptible():
+            pass
+
+
+def test_ctrl_c_that_ended_a_camera_cuts_nothing_that_follows_and_the_next_one_does() -> None:
+    with Interrupts() as interrupts:
+        send()
+        assert interrupts.end_of_camera()
+        assert interrupts.requested is None
+        reached = []
+        with interrupts.interruptible():
+            reached.append("scored")
+        with pytest.raises(KeyboardInterrupt), interrupts.interruptible():
+            send()
+        assert reached == ["scored"]
+        assert interrupts.requested == signal.SIGINT
+
+
 def test_handlers_are_restored_even_after_an_error() -> None:
     before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
     with pytest.raises(ValueError, match="inside"), Interrupts():
