@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from numpy import float32, uint8
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from splatbot.camera import Camera
 from splatbot.errors import CameraError, DeviceError
 from splatbot.frame import Frame
-from splatbot.logs.undistort import Undistorter
+from splatbot.logs.undistort import SourcePixels, Undistorter, check_lens
 from splatbot.robots.cameras.stream_options import StreamOptions
 
 
@@ -32,6 +32,21 @@ class RgbdDeviceConstants:
 
 
 CONSTANTS = RgbdDeviceConstants()
+
+_RECTIFY = "publish rectified images with its ROS driver (docs/guide/ros.md)"
+
+
+@dataclass(frozen=True)
+class Lens:
+    """The lens through which an image of a device is seen.
+
+    Args:
+        camera: camera of the image, without distortion if the device or its library has removed it.
+        source: lens model; None for those of OpenCV.
+    """
+
+    camera: Camera
+    source: SourcePixels | None = None
 
 
 class RgbdDevice:
@@ -54,7 +69,7 @@ class RgbdDevice:
         self._serial = serial
         self._closed = threading.Event()
         self._number = 0  # of the next frame
-        self._lens: tuple[Camera, Undistorter] | None = None
+        self._undistorters: dict[Lens, Undistorter] = {}
 
     def close(self) -> None:
         """End the stream."""
@@ -85,31 +100,60 @@ class RgbdDevice:
                 raise self._gone(f"no pair of colour and depth for {CONSTANTS.silence_s:g} s")
 
     def _next_frame(
-        self, stamp: float, rgb: NDArray[uint8], depth: NDArray[float32], camera: Camera, depth_delay: float
+        self, stamp: float, rgb: NDArray[uint8], depth: NDArray[float32], lenses: tuple[Lens, Lens], depth_delay: float
     ) -> Frame:
-        """Return the next frame, with the distortion of its camera removed."""
-        if camera.distortion:
-            if self._lens is None or self._lens[0] != camera:
-                self._lens = camera, Undistorter(camera)
-            undistorter = self._lens[1]
-            rgb, depth, camera = undistorter.color(rgb), undistorter.depth(depth), undistorter.camera
+        """Return the next frame, with the distortion of both images removed.
+
+        Args:
+            stamp: [s].
+            rgb: (H, W, 3).
+            depth: (H, W) [m], at the undistorted pixels of colour once its own distortion is removed.
+            lenses: of colour and of depth. The libraries of some devices align depth to colour without its distortion.
+            depth_delay: [s].
+        """
+        color_lens, depth_lens = lenses
+        if self._undistorters.keys() - lenses:
+            self._undistorters.clear()  # the device has changed its images
+        if color_lens.camera.distortion:
+            rgb = self._undistorter(color_lens).color(rgb)
+        if depth_lens.camera.distortion:
+            depth = self._undistorter(depth_lens).depth(depth)
         number, self._number = self._number, self._number + 1
         source = f"{self.uri} frame {number}"
-        return Frame(stamp, rgb, depth, camera, number, source=source, depth_delay=depth_delay)
+        return Frame(stamp, rgb, depth, color_lens.camera.pinhole, number, source=source, depth_delay=depth_delay)
 
-    def _camera(self, *intrinsics: float, size: tuple[int, int], distortion: tuple[float, ...]) -> Camera:
-        """Return the camera with fx, fy, cx, cy [px].
+    def _undistorter(self, lens: Lens) -> Undistorter:
+        if lens not in self._undistorters:
+            self._undistorters[lens] = Undistorter(lens.camera, lens.source)
+        return self._undistorters[lens]
+
+    def _camera(
+        self, *intrinsics: float, size: tuple[int, int], distortion: tuple[float, ...], fisheye: bool = False
+    ) -> Camera:
+        """Return the camera with fx, fy, cx, cy [px]; coefficients that are all 0 are no distortion.
 
         Raises:
-            DeviceError: they cannot be those of a camera.
+            DeviceError: they cannot be those of a camera, or a pinhole image cannot show most of its view.
         """
         fx, fy, cx, cy = (float(value) for value in intrinsics)
         try:
-            camera = Camera(fx, fy, cx, cy, *size, distortion if any(distortion) else ())
+            camera = Camera(fx, fy, cx, cy, *size)
             camera.check_plausible()
         except CameraError as error:
             raise self._wrong(f"{error.field} {error.message.rstrip('.')}") from error
-        return camera
+        if not any(distortion):
+            return camera
+        try:
+            distorted = replace(camera, distortion=distortion, fisheye=fisheye)
+            check_lens(distorted)
+        except CameraError as error:
+            hint = f"calibrate it with the tool of its maker, or {_RECTIFY}"
+            raise DeviceError(f"has a lens that {error.message}", file=self.uri, field="camera", hint=hint) from error
+        return distorted
+
+    def _unknown_lens(self, model: str, image: str = "colour") -> DeviceError:
+        problem = f"has {image} with a lens of the model {model}, which is not rectified here."
+        return DeviceError(problem, file=self.uri, field="camera", hint=_RECTIFY)
 
     def _cannot_be_opened(self, error: Exception, hint: str) -> DeviceError:
         return DeviceError(f"cannot be opened ({error}).", file=self.uri, field="camera", hint=hint)

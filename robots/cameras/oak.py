@@ -16,13 +16,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-from splatbot.camera import Camera
 from splatbot.errors import DeviceError
 from splatbot.frame import Frame
 from splatbot.layouts import OAK as PREFIX
 from splatbot.protocols import Array
 from splatbot.robots.cameras.device import CONSTANTS as DEVICE
-from splatbot.robots.cameras.device import RgbdDevice
+from splatbot.robots.cameras.device import Lens, RgbdDevice
 from splatbot.robots.cameras.oak_imu import OakImu, factory_rotation, imu_output
 from splatbot.robots.cameras.stream_options import StreamOptions, parse_address
 
@@ -141,7 +140,8 @@ class OakCamera(RgbdDevice):
         """Convert a pair of messages.
 
         Raises:
-            DeviceError: depth is not in millimetres, the sizes differ, or the intrinsics are missing.
+            DeviceError: depth is not in millimetres, the sizes differ, or the intrinsics are missing. A lens cannot be
+                rectified.
         """
         if depth.getType() != dai.ImgFrame.Type.RAW16:
             raise self._wrong(f"depth is {depth.getType().name}, not RAW16")
@@ -152,17 +152,29 @@ class OakCamera(RgbdDevice):
         metres = units.astype(np.float32) / np.float32(CONSTANTS.millimetres)
         middle = dai.CameraExposureOffset.MIDDLE
         at, depth_at = (image.getTimestamp(middle).total_seconds() for image in (color, depth))
-        return self._next_frame(unix + at, rgb, metres, self._factory_camera(dai, color), depth_at - at)
+        lenses = self._lens(dai, color, color, "colour"), self._lens(dai, color, depth, "depth")
+        return self._next_frame(unix + at, rgb, metres, lenses, depth_at - at)
 
-    def _factory_camera(self, dai: Any, color: Any) -> Camera:
-        """Return the factory calibration of an image, which depthai scales and crops with it."""
-        image = color.getTransformation()
-        K = np.array(image.getIntrinsicMatrix(), dtype=np.float64)
-        lens = tuple(float(value) for value in image.getDistortionCoefficients())
-        if any(lens) and (image.getDistortionModel() != dai.CameraModel.Perspective or any(lens[8:])):
-            raise self._wrong(f"colour has the lens model {image.getDistortionModel().name} {lens}")
+    def _lens(self, dai: Any, color: Any, image: Any, name: str) -> Lens:
+        """Return the lens of an image by its own transformation, with the pixels of colour.
+
+        depthai scales and crops the factory calibration with the images, and clears the coefficients of those that it
+        undistorts. Its ImageAlign removes the distortion of depth also where that of colour stays.
+
+        Raises:
+            DeviceError: the lens is of another model, or makes no sense.
+        """
+        K = np.array(color.getTransformation().getIntrinsicMatrix(), dtype=np.float64)
+        model = image.getTransformation().getDistortionModel()
+        coefficients = tuple(float(value) for value in image.getTransformation().getDistortionCoefficients())
+        models = dai.CameraModel
+        panorama = model in (models.Equirectangular, models.Cylindrical)  # those have no coefficients
+        if panorama or (any(coefficients) and model not in (models.Perspective, models.Fisheye)):
+            raise self._unknown_lens(model.name, name)
+        fisheye = model == models.Fisheye
         size = (color.getWidth(), color.getHeight())
-        return self._camera(K[0, 0], K[1, 1], K[0, 2], K[1, 2], size=size, distortion=lens[:8])
+        kept = coefficients[:4] if fisheye else coefficients
+        return Lens(self._camera(K[0, 0], K[1, 1], K[0, 2], K[1, 2], size=size, distortion=kept, fisheye=fisheye))
 
 
 def device_streams(pipeline: Any, options: StreamOptions) -> OakStreams:

@@ -7,12 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from splatbot.camera import Camera
 from splatbot.errors import DeviceError
 from splatbot.frame import Frame
 from splatbot.layouts import ORBBEC as PREFIX
 from splatbot.robots.cameras.device import CONSTANTS as DEVICE
-from splatbot.robots.cameras.device import RgbdDevice
+from splatbot.robots.cameras.device import Lens, RgbdDevice
 from splatbot.robots.cameras.stream_options import StreamOptions, parse_address
 
 DEFAULT = StreamOptions(width=640, height=480)
@@ -76,8 +75,9 @@ class OrbbecCamera(RgbdDevice):
                 if shift is None:
                     shift = color.get_system_timestamp_us() - at
                 rgb, metres = self._images(ob, color, depth)
-                camera, delay = self._color_camera(ob, color), _MICROSECOND * (depth_at - at)
-                yield self._next_frame(_MICROSECOND * (at + shift), rgb, metres, camera, delay)
+                lenses = self._lens(ob, color, color, "colour"), self._lens(ob, color, depth, "depth")
+                delay = _MICROSECOND * (depth_at - at)
+                yield self._next_frame(_MICROSECOND * (at + shift), rgb, metres, lenses, delay)
         finally:
             pipeline.stop()
 
@@ -115,15 +115,29 @@ class OrbbecCamera(RgbdDevice):
         units = np.frombuffer(depth.get_data(), np.uint16).reshape(sizes[1])
         return rgb, units.astype(np.float32) * np.float32(depth.get_depth_scale() * _MILLIMETRE)
 
-    def _color_camera(self, ob: Any, color: Any) -> Camera:
-        """Return the camera of colour, whose lens model is OpenCV's."""
-        profile = color.get_stream_profile().as_video_stream_profile()
-        i, d, models = profile.get_intrinsic(), profile.get_distortion(), ob.OBCameraDistortionModel
-        lens = tuple(float(value) for value in (d.k1, d.k2, d.p1, d.p2, d.k3, d.k4, d.k5, d.k6))
-        if any(lens) and d.model not in (models.BROWN_CONRADY, models.BROWN_CONRADY_K6):
-            raise self._wrong(f"colour has the lens model {d.model}")
-        kept = lens if any(lens[5:]) else lens[:5]
-        return self._camera(i.fx, i.fy, i.cx, i.cy, size=(i.width, i.height), distortion=kept)
+    def _lens(self, ob: Any, color: Any, image: Any, name: str) -> Lens:
+        """Return the lens of an image by its own stream profile, with the pixels of colour.
+
+        The library aligns depth to the pixels of colour without its distortion, unless "TargetDistortion" is set.
+
+        Raises:
+            DeviceError: the lens is of another model, or makes no sense.
+        """
+        i = color.get_stream_profile().as_video_stream_profile().get_intrinsic()
+        d = image.get_stream_profile().as_video_stream_profile().get_distortion()
+        models, radial = ob.OBCameraDistortionModel, (d.k1, d.k2, d.p1, d.p2, d.k3)
+        known = {
+            models.NONE: (),
+            models.BROWN_CONRADY: radial,
+            models.BROWN_CONRADY_K6: (*radial, d.k4, d.k5, d.k6),
+            models.KANNALA_BRANDT4: (d.k1, d.k2, d.k3, d.k4),
+        }
+        if any((*radial, d.k4, d.k5, d.k6)) and d.model not in known:
+            raise self._unknown_lens(d.model.name, name)
+        lens = tuple(float(value) for value in known.get(d.model, ()))
+        fisheye = d.model == models.KANNALA_BRANDT4
+        size = (i.width, i.height)
+        return Lens(self._camera(i.fx, i.fy, i.cx, i.cy, size=size, distortion=lens, fisheye=fisheye))
 
 
 def _stamp(image: Any, has_clock: bool) -> int:

@@ -8,12 +8,13 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from splatbot.camera import Camera
 from splatbot.errors import DeviceError
 from splatbot.frame import Frame
 from splatbot.layouts import REALSENSE as PREFIX
+from splatbot.logs.undistort import modified_source_pixels
 from splatbot.robots.cameras.device import CONSTANTS as DEVICE
-from splatbot.robots.cameras.device import RgbdDevice
+from splatbot.robots.cameras.device import Lens, RgbdDevice
+from splatbot.robots.cameras.realsense_align import aligns_with_lens
 from splatbot.robots.cameras.stream_options import StreamOptions, parse_address
 
 DEFAULT = StreamOptions(width=640, height=480)
@@ -91,21 +92,35 @@ class RealsenseCamera(RgbdDevice):
                 rgb = np.array(color.get_data())  # a copy: the buffer belongs to librealsense
                 metres = np.asanyarray(depth.get_data()).astype(np.float32) * np.float32(depth.get_units())
                 delay = depth_at - at if clock == depth_clock else 0.0
-                yield self._next_frame(shift + at, rgb, metres, self._color_camera(rs, color), delay)
+                yield self._next_frame(shift + at, rgb, metres, self._lenses(rs, color), delay)
         finally:
             streams.stop()
 
-    def _color_camera(self, rs: Any, color: Any) -> Camera:
-        """Return the camera of colour.
+    def _lenses(self, rs: Any, color: Any) -> tuple[Lens, Lens]:
+        """Return the lens of colour, and that of the depth which the library has aligned to it.
 
-        "Brown-Conrady" is OpenCV's lens model. "Inverse Brown-Conrady" of librealsense 2.5x projects as OpenCV's does,
-        but for a radial factor in the tangential terms. They are 1e-3 px apart with the lenses of these cameras.
+        "Brown-Conrady" and "Kannala-Brandt" are OpenCV's models. The library projects with "inverse Brown-Conrady", the
+        model of D400 colour, as with "modified Brown-Conrady" (librealsense 2.50 and later).
+
+        Raises:
+            DeviceError: the lens is of another model, or makes no sense.
         """
-        i = color.profile.as_video_stream_profile().intrinsics
-        if any(i.coeffs) and i.model not in (rs.distortion.inverse_brown_conrady, rs.distortion.brown_conrady):
-            raise self._wrong(f"colour has the lens model {i.model}")
-        size, lens = (i.width, i.height), tuple(float(value) for value in i.coeffs)
-        return self._camera(i.fx, i.fy, i.ppx, i.ppy, size=size, distortion=lens)
+        i, models = color.profile.as_video_stream_profile().intrinsics, rs.distortion
+        coefficients = tuple(float(value) for value in i.coeffs) if i.model != models.none else ()
+        modified = i.model in (models.inverse_brown_conrady, models.modified_brown_conrady)
+        fisheye = i.model == models.kannala_brandt4
+        if any(coefficients) and not (modified or fisheye or i.model == models.brown_conrady):
+            raise self._unknown_lens(i.model.name)
+        kept = coefficients[:4] if fisheye else coefficients
+        camera = self._camera(i.fx, i.fy, i.ppx, i.ppy, size=(i.width, i.height), distortion=kept, fisheye=fisheye)
+        lens = Lens(camera, modified_source_pixels if modified else None)
+        return lens, lens if camera.distortion and self._aligns_with_lens(i.model) else Lens(camera.pinhole)
+
+    def _aligns_with_lens(self, model: Any) -> bool:
+        try:
+            return aligns_with_lens(model)
+        except RuntimeError as error:
+            raise self._wrong(str(error)) from error
 
 
 class DeviceStreams:

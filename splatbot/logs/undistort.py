@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +12,9 @@ from splatbot.camera import Camera
 from splatbot.errors import CameraError
 
 Pixels = NDArray[np.float32]
+
+SourcePixels = Callable[[Camera], tuple[Pixels, Pixels]]
+"""Returns the pixels (H, W) u and v of the image of a distorted camera for those of its pinhole camera."""
 
 _MAX_SIDE = 16_384  # [px] of an image; OpenCV cannot resample sides above 32767
 _MAX_PIXELS = 2**24
@@ -26,6 +31,7 @@ class Undistorter:
 
     Args:
         camera: distorted camera, also a fisheye.
+        source: lens model. If None, it is :func:`source_pixels`: OpenCV's models, as :class:`Camera` describes them.
 
     Raises:
         CameraError: its images are too large.
@@ -35,10 +41,10 @@ class Undistorter:
         unseen: pixels (H, W) of its images that the recorded image does not show.
     """
 
-    def __init__(self, camera: Camera) -> None:
+    def __init__(self, camera: Camera, source: SourcePixels | None = None) -> None:
         check_size(camera)
         self.camera = camera.pinhole
-        self._map = source_pixels(camera)
+        self._map = (source or source_pixels)(camera)
         self.unseen = unseen(camera, self._map)
 
     def color(self, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -94,6 +100,26 @@ def source_pixels(camera: Camera) -> tuple[Pixels, Pixels]:
     size, coefficients = (camera.width, camera.height), np.array(camera.distortion)
     u, v = undistort(camera.K, coefficients, np.eye(3), camera.K, size, cv2.CV_32FC1)
     return np.asarray(u, np.float32), np.asarray(v, np.float32)
+
+
+def modified_source_pixels(camera: Camera) -> tuple[Pixels, Pixels]:
+    """Return the pixels (H, W) u and v of an image with librealsense's modified Brown-Conrady lens.
+
+    It differs from OpenCV's model in its tangential terms: they are those of the radially distorted point.
+    ``rs2_project_point_to_pixel`` of librealsense defines it, for "inverse Brown-Conrady", too.
+
+    Args:
+        camera: with the coefficients k1, k2, p1, p2, k3.
+    """
+    k1, k2, p1, p2, k3 = camera.distortion
+    x = ((np.arange(camera.width) - camera.cx) / camera.fx)[None, :]
+    y = ((np.arange(camera.height) - camera.cy) / camera.fy)[:, None]
+    square = x**2 + y**2
+    radial = np.polyval([k3, k2, k1, 1.0], square)
+    x, y = x * radial, y * radial
+    u = camera.cx + camera.fx * (x + 2 * p1 * x * y + p2 * (square + 2 * x**2))
+    v = camera.cy + camera.fy * (y + 2 * p2 * x * y + p1 * (square + 2 * y**2))
+    return u.astype(np.float32), v.astype(np.float32)
 
 
 def unseen(camera: Camera, source: tuple[Pixels, Pixels]) -> NDArray[np.bool_]:

@@ -33,6 +33,7 @@ class Packet:
         K: (3, 3) intrinsic matrix.
         sequence: its number.
         lens: distortion in depthai's order, which is OpenCV's.
+        model: name of the depthai camera model.
     """
 
     stamp: float
@@ -41,6 +42,14 @@ class Packet:
     K: NDArray[np.float64]
     sequence: int
     lens: tuple[float, ...] = ()
+    model: str = "Perspective"
+
+    @property
+    def transformation(self) -> Any:
+        """Its geometry as depthai has it."""
+        height, width = self.image.shape[:2]
+        lens = [*self.lens, *[0.0] * (14 - len(self.lens))]
+        return dai.ImgTransformation(width, height, self.K.tolist(), getattr(dai.CameraModel, self.model), lens)
 
     def message(self) -> Any:
         """Return it as depthai has it."""
@@ -53,10 +62,7 @@ class Packet:
         message.setType(getattr(dai.ImgFrame.Type, self.kind))
         message.setTimestamp(timedelta(seconds=self.stamp))
         message.setSequenceNum(self.sequence)
-        lens = [*self.lens, *[0.0] * (14 - len(self.lens))]
-        message.setTransformation(
-            dai.ImgTransformation(width, height, self.K.tolist(), dai.CameraModel.Perspective, lens)
-        )
+        message.setTransformation(self.transformation)
         return message
 
 

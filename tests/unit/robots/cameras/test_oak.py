@@ -13,9 +13,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from splatbot.camera import Camera
 from splatbot.errors import DeviceError, InputError
 from splatbot.frame import Frame
 from splatbot.logs import open_log
+from splatbot.protocols import Array
 from splatbot.robots.cameras import OakCamera, device, open_camera
 from splatbot.robots.cameras.stream_options import StreamOptions
 from tests.conftest import MakeLog
@@ -24,7 +26,9 @@ from tests.unit.robots.cameras.recorded_packets import PERIOD_S, Packet, Recorde
 DELAY_S = 0.004  # of depth
 
 
-def packets(frames: list[Frame], *, kind: str = "RGB888i", lens: tuple[float, ...] = ()) -> RecordedStreams:
+def packets(
+    frames: list[Frame], *, kind: str = "RGB888i", lens: tuple[float, ...] = (), depth_lens: tuple[float, ...] = ()
+) -> RecordedStreams:
     """Return the packets of a device that saw the frames from now on."""
     now = dai.Clock.now().total_seconds()  # type: ignore[call-arg]
     color, depth = [], []
@@ -33,7 +37,7 @@ def packets(frames: list[Frame], *, kind: str = "RGB888i", lens: tuple[float, ..
         image = frame.rgb if kind == "RGB888i" else cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2BGR)
         color.append(Packet(at, image, kind, frame.camera.K, k, lens))
         units = np.round(1000 * frame.depth).astype(np.uint16)
-        depth.append(Packet(at + DELAY_S, units, "RAW16", frame.camera.K, k))
+        depth.append(Packet(at + DELAY_S, units, "RAW16", frame.camera.K, k, depth_lens))
     return RecordedStreams(color, depth)
 
 
@@ -63,13 +67,52 @@ def test_frames_have_the_pixels_intrinsics_units_and_stamps_of_the_packets(make_
 def test_a_lens_with_distortion_is_undistorted_for_colour_and_depth(make_log: MakeLog) -> None:
     (source,) = list(open_log(make_log(1)))
     lens = (0.1, -0.2, 0.001, 0.002, 0.05)
-    (frame,) = seen(OakCamera(streams=packets([source], lens=lens)), 1)
+    (frame,) = seen(OakCamera(streams=packets([source], lens=lens, depth_lens=lens)), 1)
     K = source.camera.K
     expected = cv2.undistort(source.rgb, K, np.array(lens)).astype(int)[8:-8, 8:-8]
     assert np.abs(frame.rgb.astype(int)[8:-8, 8:-8] - expected).max() <= 6  # cv2.undistort has a map of 1/32 px
     assert np.abs(source.rgb.astype(int)[8:-8, 8:-8] - expected).max() > 60
     assert not frame.camera.distortion
     assert (frame.depth == np.round(1000 * source.depth).astype(np.float32) / np.float32(1000)).mean() < 1.0
+
+
+FISH = (0.05, -0.02, 0.01, -0.003)
+THIN = (0.1, -0.05, 0.002, -0.001, 0.01, 0.2, -0.04, 0.003, 0.004, -0.002, 0.003, 0.001, 0.01, -0.02)
+K = np.array([[120.0, 0, 81.0], [0, 118.0, 58.5], [0, 0, 1]])
+
+
+def pattern(u: Array, v: Array) -> Array:
+    """Return colours (..., 3) that change smoothly with the pixel."""
+    return 128 + np.stack([100 * np.sin(u / 9), 100 * np.cos(v / 8), 90 * np.sin((u + v) / 11)], -1)
+
+
+@pytest.mark.parametrize(("model", "lens"), [("Fisheye", FISH), ("Perspective", THIN)])
+@pytest.mark.parametrize("aligned", ["without the lens", "with the lens"])
+def test_a_wide_lens_is_undone_as_opencv_and_depthai_define_it_and_depth_by_its_own_lens(
+    model: str, lens: tuple[float, ...], aligned: str
+) -> None:
+    v, u = np.mgrid[:120, :160].astype(np.float64)
+    now = dai.Clock.now().total_seconds()  # type: ignore[call-arg]
+    color = Packet(now, np.rint(pattern(u, v)).astype(np.uint8), "RGB888i", K, 0, lens, model)
+    units = np.rint(1000 + 4 * u + 3 * v).astype(np.uint16)
+    own = lens if aligned == "with the lens" else ()
+    depth = Packet(now, units, "RAW16", K, 0, own, model)  # depthai clears the coefficients, and keeps the model
+    (frame,) = seen(OakCamera(streams=RecordedStreams([color], [depth])), 1)
+    rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], -1).reshape(-1, 1, 3)
+    project = cv2.fisheye.projectPoints if model == "Fisheye" else cv2.projectPoints
+    at = np.asarray(project(rays, np.zeros(3), np.zeros(3), K, np.array(lens))[0]).reshape(120, 160, 2)
+    by_depthai = color.transformation.project3DPoint(dai.Point3f(*rays[0, 0].tolist()))
+    np.testing.assert_allclose([by_depthai.x, by_depthai.y], at[0, 0], atol=1e-3)
+    assert np.abs(at - np.stack([u, v], -1)).max() > 5
+    inner = (at > 1).all(-1) & (at[..., 0] < 158) & (at[..., 1] < 118)
+    assert inner.mean() > 0.6
+    np.testing.assert_allclose(frame.rgb[inner], pattern(*np.moveaxis(at, -1, 0))[inner], atol=2.5)
+    x, y = np.moveaxis(at, -1, 0) if own else (u, v)
+    np.testing.assert_allclose(frame.depth[inner], (1 + 0.004 * x + 0.003 * y)[inner], atol=0.0041 if own else 1e-6)
+    assert frame.camera == Camera(120.0, 118.0, 81.0, 58.5, 160, 120)
+
+
+WIDE = np.array([[20.0, 0, 31.5], [0, 20.0, 23.5], [0, 0, 1]])
 
 
 def _changed(streams: RecordedStreams, what: str, **values: object) -> RecordedStreams:
@@ -85,7 +128,12 @@ def _changed(streams: RecordedStreams, what: str, **values: object) -> RecordedS
         ("depth", {"image": np.ones((24, 32), np.uint16)}, "24"),
         ("color", {"kind": "GRAY8", "image": np.ones((48, 64), np.uint8)}, "48"),
         ("color", {"K": np.eye(3)}, "fx"),
-        ("color", {"lens": (0.0,) * 8 + (0.3,)}, "lens"),
+        ("color", {"lens": (0.1,), "model": "RadialDivision"}, "colour with a lens of the model RadialDivision"),
+        ("depth", {"lens": (0.1,), "model": "RadialDivision"}, "depth with a lens of the model RadialDivision"),
+        ("color", {"model": "Cylindrical"}, "colour with a lens of the model Cylindrical"),
+        ("color", {"lens": (-20.0,)}, "a lens that folds the image.*calibrate it"),
+        ("color", {"lens": (0.001,), "model": "Fisheye", "K": WIDE}, "sees .* degrees.*ROS"),
+        ("color", {"lens": (np.nan,)}, "not finite"),
     ],
 )
 def test_images_of_another_kind_are_refused_by_name(

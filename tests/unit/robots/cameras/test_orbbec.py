@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import sys
 import time
+from enum import IntEnum
 from itertools import islice
 from types import SimpleNamespace
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from splatbot.camera import Camera
 from splatbot.errors import DeviceError, InputError
 from splatbot.frame import Frame
+from splatbot.protocols import Array
 from splatbot.robots.cameras import OrbbecCamera, device, open_camera
 from splatbot.robots.cameras.stream_options import StreamOptions
 
@@ -23,6 +27,17 @@ DEVICE_EPOCH = 5_000_000  # [us] stamp of image 0 in the clock of the device
 
 class OBError(Exception):
     """The exception of the library."""
+
+
+class LensModel(IntEnum):
+    """OBCameraDistortionModel with the values of pyorbbecsdk2 2.1."""
+
+    NONE = 0
+    MODIFIED_BROWN_CONRADY = 1
+    INVERSE_BROWN_CONRADY = 2
+    BROWN_CONRADY = 3
+    BROWN_CONRADY_K6 = 4
+    KANNALA_BRANDT4 = 5
 
 
 class Image:
@@ -93,7 +108,7 @@ class Library:
     OBStreamType = SimpleNamespace(COLOR_STREAM="colour stream", DEPTH_STREAM="depth stream")
     OBFormat = SimpleNamespace(RGB="RGB", Y16="Y16")
     OBFrameAggregateOutputMode = SimpleNamespace(FULL_FRAME_REQUIRE="full")
-    OBCameraDistortionModel = SimpleNamespace(BROWN_CONRADY=3, BROWN_CONRADY_K6=4)
+    OBCameraDistortionModel = LensModel
 
     def __init__(self, sets: list[FrameSet | None], *, clock: bool = True, serials: tuple[str, ...] = ("A1",)) -> None:
         self._sets, self._clock, self._serials = iter(sets), clock, serials
@@ -145,13 +160,23 @@ class Library:
         return SimpleNamespace(process=lambda images: images)
 
 
-NO_LENS = SimpleNamespace(k1=0, k2=0, p1=0, p2=0, k3=0, k4=0, k5=0, k6=0, model=0)
+COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+
+
+def lens_of(model: LensModel, **values: float) -> Any:
+    return SimpleNamespace(**dict.fromkeys(COEFFICIENTS, 0.0) | values, model=model)
+
+
+NO_LENS = lens_of(LensModel.NONE)
 RGB = np.arange(HEIGHT * WIDTH * 3, dtype=np.uint32).astype(np.uint8).reshape(HEIGHT, WIDTH, 3)
 
 
-def images(number: int, unix_us: int = 1_700_000_000_000_000, *, lens: Any = NO_LENS, kind: str = "RGB") -> FrameSet:
+UNIX_US = 1_700_000_000_000_000
+
+
+def images(number: int, *, kind: str = "RGB") -> FrameSet:
     depth = np.full((HEIGHT, WIDTH), 2400, np.uint16)
-    return FrameSet(Image(number, RGB, kind, unix_us, 0, lens), Image(number, depth, "Y16", unix_us, 4_000, lens))
+    return FrameSet(Image(number, RGB, kind, UNIX_US, 0, NO_LENS), Image(number, depth, "Y16", UNIX_US, 4_000, NO_LENS))
 
 
 def use(monkeypatch: pytest.MonkeyPatch, library: Library) -> Library:
@@ -186,14 +211,65 @@ def test_without_a_global_clock_the_devices_is_shifted_by_the_first_image(monkey
     assert frames[2].stamp - frames[0].stamp == pytest.approx(2 * 0.033333, abs=1e-6)
 
 
-def test_a_distorted_lens_is_undone_and_an_unknown_one_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    values = {"k1": 0.1, "k2": -0.05, "p1": 0.001, "p2": 0.0, "k3": 0.0, "k4": 0.0, "k5": 0.0, "k6": 0.0}
-    use(monkeypatch, Library([images(0, lens=SimpleNamespace(**values, model=3))]))
+RADIAL = {"k1": 0.3, "k2": -0.1, "p1": 0.02, "p2": -0.01, "k3": 0.05}
+LENSES = {
+    LensModel.BROWN_CONRADY: RADIAL,
+    LensModel.BROWN_CONRADY_K6: RADIAL | {"k4": 0.2, "k5": -0.04, "k6": 0.003},
+    LensModel.KANNALA_BRANDT4: {"k1": 0.05, "k2": -0.02, "k3": 0.01, "k4": -0.003},
+}
+
+
+def lens_pair(lens: Any, depth_lens: Any) -> FrameSet:
+    """Return smooth colours and a slope of depth, seen through lenses."""
+    v, u = np.mgrid[:HEIGHT, :WIDTH].astype(np.float64)
+    units = np.rint(2400 + 10 * u + 8 * v).astype(np.uint16)
+    color = Image(0, np.rint(pattern(u, v)).astype(np.uint8), "RGB", UNIX_US, 0, lens)
+    return FrameSet(color, Image(0, units, "Y16", UNIX_US, 0, depth_lens))
+
+
+def pattern(u: Array, v: Array) -> Array:
+    return 128 + np.stack([100 * np.sin(u / 9), 100 * np.cos(v / 8), 90 * np.sin((u + v) / 11)], -1)
+
+
+@pytest.mark.parametrize("model", list(LENSES))
+@pytest.mark.parametrize("depth_has_it", [False, True], ids=["depth aligned without the lens", "depth with the lens"])
+def test_each_image_is_undone_by_its_own_lens_as_opencv_defines_it(
+    monkeypatch: pytest.MonkeyPatch, model: LensModel, depth_has_it: bool
+) -> None:
+    lens = lens_of(model, **LENSES[model])
+    use(monkeypatch, Library([lens_pair(lens, lens if depth_has_it else lens_of(model))]))
     (frame,) = seen("orbbec://", 1)
-    assert not frame.camera.distortion
-    assert not (frame.rgb == RGB).all()
-    use(monkeypatch, Library([images(0, lens=SimpleNamespace(**values, model=5))]))
-    with pytest.raises(DeviceError, match="lens model 5"):
+    v, u = np.mgrid[:HEIGHT, :WIDTH].astype(np.float64)
+    rays = np.stack([(u - 40.5) / 70, (v - 29) / 71, np.ones_like(u)], -1).reshape(-1, 1, 3)
+    fisheye = model == LensModel.KANNALA_BRANDT4
+    names = ("k1", "k2", "k3", "k4") if fisheye else COEFFICIENTS
+    project = cv2.fisheye.projectPoints if fisheye else cv2.projectPoints
+    K, known = np.array([[70.0, 0, 40.5], [0, 71, 29], [0, 0, 1]]), np.array([getattr(lens, name) for name in names])
+    at = np.asarray(project(rays, np.zeros(3), np.zeros(3), K, known)[0], np.float64).reshape(HEIGHT, WIDTH, 2)
+    assert np.abs(at - np.stack([u, v], -1)).max() > 2
+    inner = (at > 1).all(-1) & (at[..., 0] < WIDTH - 2) & (at[..., 1] < HEIGHT - 2)
+    assert inner.mean() > 0.6
+    x, y = np.moveaxis(at, -1, 0)
+    np.testing.assert_allclose(frame.rgb[inner], pattern(x, y)[inner], atol=2.5)
+    of = (x, y) if depth_has_it else (u, v)
+    wanted = 0.00025 * (2400 + 10 * of[0] + 8 * of[1])  # units of 0.25 mm
+    np.testing.assert_allclose(frame.depth[inner], wanted[inner], atol=0.0025 if depth_has_it else 1e-6)
+    assert frame.camera == Camera(70.0, 71.0, 40.5, 29.0, WIDTH, HEIGHT)
+
+
+@pytest.mark.parametrize(
+    ("lens", "depth_lens", "problem"),
+    [
+        (lens_of(LensModel.INVERSE_BROWN_CONRADY, **RADIAL), NO_LENS, "colour with a lens of the model INVERSE_BROWN"),
+        (NO_LENS, lens_of(LensModel.MODIFIED_BROWN_CONRADY, **RADIAL), "depth with a lens of the model MODIFIED_BROWN"),
+        (lens_of(LensModel.BROWN_CONRADY, k1=-20.0), NO_LENS, "a lens that folds the image.*calibrate it"),
+    ],
+)
+def test_a_lens_that_cannot_be_rectified_is_refused_with_its_model_and_a_fix(
+    monkeypatch: pytest.MonkeyPatch, lens: Any, depth_lens: Any, problem: str
+) -> None:
+    use(monkeypatch, Library([lens_pair(lens, depth_lens)]))
+    with pytest.raises(DeviceError, match=f"{problem}.*ROS driver"):
         seen("orbbec://", 1)
 
 

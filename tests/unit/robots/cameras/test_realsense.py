@@ -8,12 +8,14 @@ from collections.abc import Callable
 from itertools import islice
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from splatbot.errors import DeviceError, InputError
 from splatbot.frame import Frame
+from splatbot.protocols import Array
 from splatbot.robots.cameras import RealsenseCamera, device, open_camera
 from splatbot.robots.cameras.stream_options import StreamOptions
 
@@ -39,6 +41,7 @@ class SoftwareStreams:
         images: list[tuple[NDArray[np.uint8], NDArray[np.uint16]]],
         *,
         lens: tuple[float, ...] = NO_LENS,
+        model: str = "inverse_brown_conrady",
         baseline: float = 0.0,
         domain: Any = None,
         missing: tuple[int, ...] = (),
@@ -46,7 +49,6 @@ class SoftwareStreams:
         self._images, self._missing = images, missing
         self._domain = domain or rs.timestamp_domain.hardware_clock
         self._device = rs.software_device()
-        model = rs.distortion.inverse_brown_conrady
         self._profiles = []
         for name, stream, kind, size, lenses in (
             ("Stereo Module", rs.stream.depth, rs.format.z16, 2, NO_LENS),
@@ -56,7 +58,8 @@ class SoftwareStreams:
             video = rs.video_stream()
             video.type, video.index, video.uid, video.fmt, video.bpp = stream, 0, size - 2, kind, size
             video.width, video.height, video.fps = WIDTH, HEIGHT, 30
-            video.intrinsics = intrinsics(140.0 if size == 3 else 130.0, model, lenses)
+            kind_of_lens = getattr(rs.distortion, model if size == 3 else "none")
+            video.intrinsics = intrinsics(140.0 if size == 3 else 130.0, kind_of_lens, lenses)
             self._profiles.append((sensor, sensor.add_video_stream(video), size))
         moved = rs.extrinsics()
         moved.rotation, moved.translation = [1, 0, 0, 0, 1, 0, 0, 0, 1], [baseline, 0, 0]
@@ -169,6 +172,68 @@ def test_a_distorted_lens_is_undone_as_librealsense_defines_it() -> None:
     assert len(errors) > 100
     assert max(errors) < 4.0
     assert not frame.camera.distortion
+
+
+def pattern(u: Array, v: Array) -> Array:
+    """Return colours (..., 3) that change smoothly with the pixel."""
+    return 128 + np.stack([100 * np.sin(u / 9), 100 * np.cos(v / 8), 90 * np.sin((u + v) / 11)], -1)
+
+
+BROWN = (0.3, -0.2, 0.02, -0.015, 0.05)
+
+
+@pytest.mark.parametrize(
+    ("model", "lens"),
+    [
+        ("brown_conrady", BROWN),
+        ("modified_brown_conrady", BROWN),
+        ("inverse_brown_conrady", BROWN),
+        ("kannala_brandt4", (0.05, -0.02, 0.01, -0.003, 0.0)),
+    ],
+)
+def test_each_lens_is_undone_as_librealsense_projects_and_depth_is_at_the_same_pixels(
+    model: str, lens: tuple[float, ...]
+) -> None:
+    v, u = np.mgrid[:HEIGHT, :WIDTH].astype(np.float64)
+    rgb = np.rint(pattern(u, v)).astype(np.uint8)
+    slope = 0.01  # of depth [m] a pixel
+    metres = 0.5 + slope * u
+    images = [(rgb, np.rint(metres / UNITS).astype(np.uint16))] * 4
+    (frame,) = seen(opened(lambda: SoftwareStreams(images, lens=lens, model=model)), 1)
+    x, y = (u - 80.5) / 140, (v - 58) / 141
+    given = intrinsics(140.0, getattr(rs.distortion, model), lens)
+    rays = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3)
+    at = np.array([rs.rs2_project_point_to_pixel(given, ray) for ray in rays.tolist()]).reshape(HEIGHT, WIDTH, 2)
+    if model in ("brown_conrady", "kannala_brandt4"):
+        fisheye = model == "kannala_brandt4"
+        K, known = np.array([[140.0, 0, 80.5], [0, 141, 58], [0, 0, 1]]), np.array(lens[:4] if fisheye else lens)
+        project = cv2.fisheye.projectPoints if fisheye else cv2.projectPoints
+        by_opencv = project(rays[:, None], np.zeros(3), np.zeros(3), K, known)[0]
+        np.testing.assert_allclose(at.reshape(-1, 2), np.reshape(by_opencv, (-1, 2)), atol=1e-3)
+    assert np.abs(at - np.stack([u, v], -1)).max() > 4
+    inner = (at > 1).all(-1) & (at[..., 0] < WIDTH - 2) & (at[..., 1] < HEIGHT - 2)
+    assert inner.mean() > 0.6
+    np.testing.assert_allclose(frame.rgb[inner], pattern(*np.moveaxis(at, -1, 0))[inner], atol=2.5)
+    seen_by_both = inner & (frame.depth > 0)
+    assert seen_by_both.mean() > 0.5
+    wanted = 0.5 + slope * (80.5 + 130 * x)  # the depth camera is at the same place, and has no lens
+    np.testing.assert_allclose(frame.depth[seen_by_both], wanted[seen_by_both], atol=2 * slope)  # the nearest wins
+    assert not frame.camera.distortion
+
+
+@pytest.mark.parametrize(
+    ("model", "lens", "problem"),
+    [
+        ("ftheta", (0.9, 0.0, 0.0, 0.0, 0.0), "colour with a lens of the model ftheta.*ROS driver"),
+        ("brown_conrady", (-30.0, 0.0, 0.0, 0.0, 0.0), "a lens that folds the image.*calibrate it"),
+    ],
+)
+def test_a_lens_that_cannot_be_rectified_is_refused_with_its_model_and_a_fix(
+    model: str, lens: tuple[float, ...], problem: str
+) -> None:
+    with pytest.raises(DeviceError, match=problem) as caught:
+        seen(opened(lambda: SoftwareStreams(scene(4), lens=lens, model=model)), 1)
+    assert caught.value.file == "realsense://"
 
 
 def test_lost_images_are_counted_and_a_silent_device_is_gone(monkeypatch: pytest.MonkeyPatch) -> None:
