@@ -37,7 +37,7 @@ _RECTIFY = "publish rectified images with its ROS driver (docs/guide/ros.md)"
 
 
 @dataclass(frozen=True)
-class Lens:
+class ImageLens:
     """The lens through which an image of a device is seen.
 
     Args:
@@ -69,7 +69,7 @@ class RgbdDevice:
         self._serial = serial
         self._closed = threading.Event()
         self._number = 0  # of the next frame
-        self._undistorters: dict[Lens, Undistorter] = {}
+        self._undistorters: dict[ImageLens, Undistorter] = {}
 
     def close(self) -> None:
         """End the stream."""
@@ -100,7 +100,12 @@ class RgbdDevice:
                 raise self._gone(f"no pair of colour and depth for {CONSTANTS.silence_s:g} s")
 
     def _next_frame(
-        self, stamp: float, rgb: NDArray[uint8], depth: NDArray[float32], lenses: tuple[Lens, Lens], depth_delay: float
+        self,
+        stamp: float,
+        rgb: NDArray[uint8],
+        depth: NDArray[float32],
+        lenses: tuple[ImageLens, ImageLens],
+        depth_delay: float,
     ) -> Frame:
         """Return the next frame, with the distortion of both images removed.
 
@@ -122,7 +127,7 @@ class RgbdDevice:
         source = f"{self.uri} frame {number}"
         return Frame(stamp, rgb, depth, color_lens.camera.pinhole, number, source=source, depth_delay=depth_delay)
 
-    def _undistorter(self, lens: Lens) -> Undistorter:
+    def _undistorter(self, lens: ImageLens) -> Undistorter:
         if lens not in self._undistorters:
             self._undistorters[lens] = Undistorter(lens.camera, lens.source)
         return self._undistorters[lens]

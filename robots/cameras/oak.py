@@ -21,7 +21,7 @@ from splatbot.frame import Frame
 from splatbot.layouts import OAK as PREFIX
 from splatbot.protocols import Array
 from splatbot.robots.cameras.device import CONSTANTS as DEVICE
-from splatbot.robots.cameras.device import Lens, RgbdDevice
+from splatbot.robots.cameras.device import ImageLens, RgbdDevice
 from splatbot.robots.cameras.oak_imu import OakImu, factory_rotation, imu_output
 from splatbot.robots.cameras.stream_options import StreamOptions, parse_address
 
@@ -155,7 +155,7 @@ class OakCamera(RgbdDevice):
         lenses = self._lens(dai, color, color, "colour"), self._lens(dai, color, depth, "depth")
         return self._next_frame(unix + at, rgb, metres, lenses, depth_at - at)
 
-    def _lens(self, dai: Any, color: Any, image: Any, name: str) -> Lens:
+    def _lens(self, dai: Any, color: Any, image: Any, name: str) -> ImageLens:
         """Return the lens of an image by its own transformation, with the pixels of colour.
 
         depthai scales and crops the factory calibration with the images, and clears the coefficients of those that it
@@ -174,7 +174,7 @@ class OakCamera(RgbdDevice):
         fisheye = model == models.Fisheye
         size = (color.getWidth(), color.getHeight())
         kept = coefficients[:4] if fisheye else coefficients
-        return Lens(self._camera(K[0, 0], K[1, 1], K[0, 2], K[1, 2], size=size, distortion=kept, fisheye=fisheye))
+        return ImageLens(self._camera(K[0, 0], K[1, 1], K[0, 2], K[1, 2], size=size, distortion=kept, fisheye=fisheye))
 
 
 def device_streams(pipeline: Any, options: StreamOptions) -> OakStreams:

@@ -15,7 +15,7 @@ from splatbot.layouts import OPENCV as PREFIX
 from splatbot.logs.calibration import Calibration
 from splatbot.logs.presets import find_calibration
 from splatbot.robots.cameras.device import CONSTANTS as DEVICE
-from splatbot.robots.cameras.device import Lens, RgbdDevice
+from splatbot.robots.cameras.device import ImageLens, RgbdDevice
 from splatbot.robots.cameras.stream_options import StreamOptions
 
 BACKENDS = {
@@ -120,4 +120,4 @@ class OpenCvCamera(RgbdDevice):
                 hint="give the camera file of these images",
             )
         rgb, metres = np.ascontiguousarray(bgr[..., ::-1]), units.astype(np.float32) / np.float32(scale)
-        return self._next_frame(stamp, rgb, metres, (Lens(camera), Lens(camera)), 0.0)
+        return self._next_frame(stamp, rgb, metres, (ImageLens(camera), ImageLens(camera)), 0.0)

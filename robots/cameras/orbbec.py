@@ -11,7 +11,7 @@ from splatbot.errors import DeviceError
 from splatbot.frame import Frame
 from splatbot.layouts import ORBBEC as PREFIX
 from splatbot.robots.cameras.device import CONSTANTS as DEVICE
-from splatbot.robots.cameras.device import Lens, RgbdDevice
+from splatbot.robots.cameras.device import ImageLens, RgbdDevice
 from splatbot.robots.cameras.stream_options import StreamOptions, parse_address
 
 DEFAULT = StreamOptions(width=640, height=480)
@@ -115,7 +115,7 @@ class OrbbecCamera(RgbdDevice):
         units = np.frombuffer(depth.get_data(), np.uint16).reshape(sizes[1])
         return rgb, units.astype(np.float32) * np.float32(depth.get_depth_scale() * _MILLIMETRE)
 
-    def _lens(self, ob: Any, color: Any, image: Any, name: str) -> Lens:
+    def _lens(self, ob: Any, color: Any, image: Any, name: str) -> ImageLens:
         """Return the lens of an image by its own stream profile, with the pixels of colour.
 
         The library aligns depth to the pixels of colour without its distortion, unless "TargetDistortion" is set.
@@ -137,7 +137,7 @@ class OrbbecCamera(RgbdDevice):
         lens = tuple(float(value) for value in known.get(d.model, ()))
         fisheye = d.model == models.KANNALA_BRANDT4
         size = (i.width, i.height)
-        return Lens(self._camera(i.fx, i.fy, i.cx, i.cy, size=size, distortion=lens, fisheye=fisheye))
+        return ImageLens(self._camera(i.fx, i.fy, i.cx, i.cy, size=size, distortion=lens, fisheye=fisheye))
 
 
 def _stamp(image: Any, has_clock: bool) -> int:

@@ -13,7 +13,7 @@ from splatbot.frame import Frame
 from splatbot.layouts import REALSENSE as PREFIX
 from splatbot.logs.undistort import modified_source_pixels
 from splatbot.robots.cameras.device import CONSTANTS as DEVICE
-from splatbot.robots.cameras.device import Lens, RgbdDevice
+from splatbot.robots.cameras.device import ImageLens, RgbdDevice
 from splatbot.robots.cameras.realsense_align import aligns_with_lens
 from splatbot.robots.cameras.stream_options import StreamOptions, parse_address
 
@@ -96,7 +96,7 @@ class RealsenseCamera(RgbdDevice):
         finally:
             streams.stop()
 
-    def _lenses(self, rs: Any, color: Any) -> tuple[Lens, Lens]:
+    def _lenses(self, rs: Any, color: Any) -> tuple[ImageLens, ImageLens]:
         """Return the lens of colour, and that of the depth which the library has aligned to it.
 
         "Brown-Conrady" and "Kannala-Brandt" are OpenCV's models. The library projects with "inverse Brown-Conrady", the
@@ -113,8 +113,8 @@ class RealsenseCamera(RgbdDevice):
             raise self._unknown_lens(i.model.name)
         kept = coefficients[:4] if fisheye else coefficients
         camera = self._camera(i.fx, i.fy, i.ppx, i.ppy, size=(i.width, i.height), distortion=kept, fisheye=fisheye)
-        lens = Lens(camera, modified_source_pixels if modified else None)
-        return lens, lens if camera.distortion and self._aligns_with_lens(i.model) else Lens(camera.pinhole)
+        lens = ImageLens(camera, modified_source_pixels if modified else None)
+        return lens, lens if camera.distortion and self._aligns_with_lens(i.model) else ImageLens(camera.pinhole)
 
     def _aligns_with_lens(self, model: Any) -> bool:
         try:

@@ -1,4 +1,4 @@
-"""Whether this build of librealsense aligns depth to colour with the lens of colour, or to colour without its lens."""
+"""Test of this build of librealsense: it aligns depth to colour with the lens of colour, or without."""
 
 from __future__ import annotations
 
