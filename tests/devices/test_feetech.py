@@ -32,6 +32,15 @@ def device() -> Iterator[FakeFeetech]:
 
 @pytest.fixture
 def gripper(device: FakeFeetech) -> Iterator[FeetechGripper]:
+    """A driver that waits long for answers, which a busy machine gives late."""
+    with FeetechGripper(device.port, JAW, timeout=5.0) as one:
+        one.activate()
+        yield one
+
+
+@pytest.fixture
+def hasty(device: FakeFeetech) -> Iterator[FeetechGripper]:
+    """A driver that waits briefly, for lines without good answers."""
     with FeetechGripper(device.port, JAW, timeout=0.03) as one:
         one.activate()
         yield one
@@ -41,8 +50,7 @@ def gripper(device: FakeFeetech) -> Iterator[FeetechGripper]:
 @pytest.mark.parametrize("ends", [(2030, 3330), (3330, 2030)])
 def test_it_activates_moves_and_reports_its_opening(shape: str, ends: tuple[int, int]) -> None:
     jaw = JawCalibration(*ends, 0.10, 20.0, shape)  # type: ignore[arg-type]
-    # A busy machine answers late; the time-out of the other tests would repeat an exchange that is only delayed.
-    with FakeFeetech(jaw, hurry=HURRY) as device, FeetechGripper(device.port, jaw, timeout=1.0) as gripper:
+    with FakeFeetech(jaw, hurry=HURRY) as device, FeetechGripper(device.port, jaw, timeout=5.0) as gripper:
         assert isinstance(gripper, Gripper)
         gripper.activate()
         for opening in (0.03, 0.0, 0.10, 0.0501):
@@ -226,19 +234,19 @@ def test_a_thousand_commands_on_a_line_that_loses_bytes_end_done_or_as_an_error(
     ids=["silent", "drops", "halves", "flips", "late"],
 )
 def test_a_line_that_never_gives_a_good_answer_is_a_typed_error_after_bounded_tries(
-    gripper: FeetechGripper, device: FakeFeetech, faults: LineFaults
+    hasty: FeetechGripper, device: FakeFeetech, faults: LineFaults
 ) -> None:
     device.faults = faults
     with pytest.raises(NoAnswerError, match="no good answer to 5 tries"):
-        gripper.move(0.01)
+        hasty.move(0.01)
     device.faults = LineFaults()
     time.sleep(0.3 if faults.delay else 0.0)
     with pytest.raises(GripperError, match="takes no move"):
-        gripper.move(0.02)
-    gripper.activate()
-    gripper.move(0.02)
-    gripper.wait()
-    assert gripper.opening() == pytest.approx(0.02, abs=COUNT_M)
+        hasty.move(0.02)
+    hasty.activate()
+    hasty.move(0.02)
+    hasty.wait()
+    assert hasty.opening() == pytest.approx(0.02, abs=COUNT_M)
 
 
 def test_an_adapter_that_echoes_is_an_error_and_not_believed() -> None:
@@ -255,7 +263,7 @@ def test_an_adapter_that_echoes_is_an_error_and_not_believed() -> None:
 
     thread = threading.Thread(target=echo, daemon=True)
     thread.start()
-    with FeetechGripper(os.ttyname(slave), JAW, timeout=0.03, retries=1) as gripper:
+    with FeetechGripper(os.ttyname(slave), JAW, timeout=5.0, retries=1) as gripper:
         with pytest.raises(NoAnswerError, match="echo"):
             gripper.activate()
         with pytest.raises(NoAnswerError, match="echo of the request"):

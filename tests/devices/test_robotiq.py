@@ -28,14 +28,22 @@ def device() -> Iterator[FakeRobotiq]:
 
 @pytest.fixture
 def gripper(device: FakeRobotiq) -> Iterator[RobotiqGripper]:
+    """A driver that waits long for answers, which a busy machine gives late."""
+    with RobotiqGripper(device.port, timeout=5.0) as one:
+        one.activate()
+        yield one
+
+
+@pytest.fixture
+def hasty(device: FakeRobotiq) -> Iterator[RobotiqGripper]:
+    """A driver that waits briefly, for lines without good answers."""
     with RobotiqGripper(device.port, timeout=0.03) as one:
         one.activate()
         yield one
 
 
 def test_it_activates_moves_and_tells_where_it_is(device: FakeRobotiq) -> None:
-    # A busy machine answers late; the time-out of the other tests would repeat an exchange that is only delayed.
-    with RobotiqGripper(device.port, timeout=1.0) as gripper:
+    with RobotiqGripper(device.port, timeout=5.0) as gripper:
         assert isinstance(gripper, Gripper)
         gripper.activate()
         for opening in (0.03, 0.0, 0.085, 0.0501):
@@ -188,20 +196,20 @@ def test_a_thousand_commands_on_a_line_that_loses_bytes_end_done_or_as_an_error_
     ids=["silent", "drops", "halves", "flips", "late"],
 )
 def test_a_line_that_never_gives_a_good_answer_is_a_typed_error_after_bounded_tries(
-    gripper: RobotiqGripper, device: FakeRobotiq, faults: LineFaults, error: type[GripperError]
+    hasty: RobotiqGripper, device: FakeRobotiq, faults: LineFaults, error: type[GripperError]
 ) -> None:
     device.faults = faults
     with pytest.raises(error, match="no good answer to 5 tries"):
-        gripper.move(0.01)
-    assert gripper.unsafe
+        hasty.move(0.01)
+    assert hasty.unsafe
     device.faults = LineFaults()
     time.sleep(0.3 if faults.delay else 0.0)
     with pytest.raises(GripperError, match="takes no move"):
-        gripper.move(0.02)
-    gripper.activate()
-    gripper.move(0.02)
-    gripper.wait()
-    assert gripper.opening() == pytest.approx(0.02, abs=3e-4)
+        hasty.move(0.02)
+    hasty.activate()
+    hasty.move(0.02)
+    hasty.wait()
+    assert hasty.opening() == pytest.approx(0.02, abs=3e-4)
 
 
 def test_an_unplugged_gripper_is_a_typed_error_and_its_port_is_given_back(
@@ -231,7 +239,7 @@ def test_a_port_that_is_not_there_or_taken_is_named(device: FakeRobotiq) -> None
 def test_another_kind_of_device_is_refused_not_believed(device: FakeRobotiq) -> None:
     with RobotiqGripper(device.port, timeout=0.03, retries=0, device=3) as other, pytest.raises(NoAnswerError):
         other.status()
-    with RobotiqGripper(device.port, timeout=0.03) as gripper, pytest.raises(RefusedError, match="no such register"):
+    with RobotiqGripper(device.port, timeout=5.0) as gripper, pytest.raises(RefusedError, match="no such register"):
         gripper._open_client.read(0x1000, 1)
 
 
