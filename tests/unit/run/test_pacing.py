@@ -120,7 +120,7 @@ def test_a_log_slower_than_its_own_pace_costs_no_frame(monkeypatch: pytest.Monke
     log.asked = asked
 
     def ask(reader: _FrameReader, clock: Any) -> Any:
-        asked.release()  # so that none is decoded before, however long a busy machine takes for the last one
+        asked.release()  # none is decoded before, however busy the machine is
         return take(reader, clock)
 
     monkeypatch.setattr(_FrameReader, "take", ask)
