@@ -246,9 +246,12 @@ class RobotMask:
         """Return the frame with the robot masked as it is at a time [s] after the frame's stamp."""
         mask, delay = self._mask_of(frame), after + self.joint_delay
         stamp, wait_s = frame.stamp + delay, _WAIT_S + max(delay, 0.0)
-        come = self.history.reaches(stamp - wait_s)
-        if not mask.has_camera or (self._link_poses and not come):
-            return self._link_poses.mask(mask, frame, stamp, wait_s)
+        if not mask.has_camera or (self._link_poses and not self.history.reaches(stamp - wait_s)):
+            try:
+                return self._link_poses.mask(mask, frame, stamp, wait_s)
+            except JointsUnknownError:
+                if not mask.has_camera or not self.history.reaches(stamp - wait_s):
+                    raise  # else the first joint states have come during the wait for TF
         q = self.history.at(stamp, wait_s)
         return mask.at_joints(frame, q, self.history.names)
 
