@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -36,14 +35,12 @@ from splatbot.services.topics import FRAME, RESULT, JointState, arm_topic, map_t
 from splatbot.slam import FrameResult
 from tests.conftest import MakeLog
 from tests.models import random_model
+from tests.waiting import until
 
 
 def _until(found: Callable[[], Any]) -> Any:
-    for _ in range(500):
-        if (value := found()) is not None:
-            return value
-        time.sleep(0.01)
-    raise AssertionError("nothing came")
+    until(lambda: found() is not None)
+    return found()
 
 
 @pytest.fixture
