@@ -31,6 +31,7 @@ from splatbot.protocols import Array
 from splatbot.results.folder import RunFolder
 from splatbot.results.margin import CONSTANTS as MARGIN
 from splatbot.results.margin import AuditedError, audited_error
+from splatbot.results.measured import surface_outside
 from splatbot.results.plan_obstacles import PlanObstacles
 from splatbot.results.region_plan import RegionPlan, plan_in_region
 from splatbot.results.views import raw_views
@@ -75,6 +76,7 @@ class MappedScene:
         plane: (4,) support plane [m, world], or None.
         box: (2, 3) corners of the workspace [m, base].
         error: audited error of the map.
+        measured: (M, 4) spheres around measured surface outside of the map [m, world], as in `splatbot plan`.
         points: (P, 3) points in reach that two frames measure [m, world].
     """
 
@@ -84,6 +86,7 @@ class MappedScene:
     plane: Array | None
     box: Array
     error: AuditedError
+    measured: Array
     points: Array
 
 
@@ -124,7 +127,9 @@ def open_scene(run: Path) -> MappedScene:
         agreeing_views=MARGIN.agreeing_views,
     )
     error = audited_error(run, log, field)
-    return MappedScene(model, field, place.T_world_base, place.support_plane, place.box, error, points)
+    arm = RobotSpheres(robot, T_world_base=place.T_world_base)
+    measured = surface_outside(folder, log, field, arm)
+    return MappedScene(model, field, place.T_world_base, place.support_plane, place.box, error, measured, points)
 
 
 def measure(scene: MappedScene, paths: int, seed: int = 0) -> tuple[list[PathClearance], int]:
@@ -177,7 +182,7 @@ def _plans(scene: MappedScene, problems: Sequence[Problem]) -> Iterator[RegionPl
 def _plan(scene: MappedScene, problem: Problem) -> RegionPlan:
     robot, T = panda(), scene.T_world_base
     arm = RobotSpheres(robot, T_world_base=T)
-    around = PlanObstacles(scene.field, scene.model, arm, problem.start, plane=scene.plane)
+    around = PlanObstacles(scene.field, scene.model, arm, problem.start, plane=scene.plane, measured=scene.measured)
     return plan_in_region(
         lambda margin: GaussianRRTStar(around.field(margin), robot, T_world_base=T, margin=margin),
         lambda planner: planner.plan(problem.start, problem.goal, budget_ms=_PLAN["budget_ms"], seed=_PLAN["seed"]),

@@ -36,6 +36,11 @@ class MarginSource:
     margin: float
     why: str
 
+    @property
+    def audited(self) -> bool:
+        """Return whether the margin is the audited error of the map."""
+        return self.error is not None
+
 
 def margin_source(served: ServedMap, given: Margin, field: GaussianCollisionField | None = None) -> MarginSource:
     """Return the source of a margin. The audit of a map version takes seconds, once for each kind of field.

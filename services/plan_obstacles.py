@@ -1,4 +1,4 @@
-"""Obstacles of plans in served maps in addition to the map: support plane and unknown space."""
+"""Obstacles of plans in served maps in addition to the map: support plane, measured surface and unknown space."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from splatbot.collision import RobotSpheres
 from splatbot.collision.unknown import UnknownPolicy
 from splatbot.errors import InputError
+from splatbot.results.measured import surface_outside
 from splatbot.results.plan_obstacles import PlanObstacles
 from splatbot.results.unknown import unknown_in_reach
 from splatbot.robots.in_view import reopen_log
@@ -24,10 +25,12 @@ def plan_obstacles(
     *,
     policy: UnknownPolicy = "free",
     support: bool = True,
+    measured: bool = False,
 ) -> PlanObstacles:
-    """Return the obstacles of a plan: the map, its support plane, and its unknown space under a policy.
+    """Return the obstacles of a plan: the map, its support plane, measured surface, and unknown space under a policy.
 
-    The search for unknown space takes seconds, once for each map version and robot. :func:`check_unknown` comes first.
+    The searches for unknown space and for measured surface take seconds, once for each map version, robot and base.
+    :func:`check_unknown` comes first.
 
     Args:
         served: the map.
@@ -36,15 +39,30 @@ def plan_obstacles(
         start: (J,) configuration at which the arm is [rad or m]; the space that it fills is no obstacle.
         policy: treatment of unknown space.
         support: whether the support plane of the map's scene.yaml is an obstacle.
+        measured: whether surface that the recording of the map measured and the map lacks is an obstacle.
     """
     arm = RobotSpheres(robot, T_world_base=T_world_base)
     known = served.workspace.support_plane if served.workspace is not None and support else None
-    space = None
+    run, space, surface = served.run, None, None
     if policy != "free":
-        run = served.run
         assert run is not None  # by check_unknown
         space = served.derived.get(("unknown space", robot.name), lambda: unknown_in_reach(run, reopen_log(run), arm))
-    return PlanObstacles(served.field, served.ready.model, arm, start, plane=known, space=space, policy=policy)
+    if measured:
+        assert run is not None  # by margin_source
+        surface = served.derived.get(
+            ("measured surface", robot.name, T_world_base.tobytes()),
+            lambda: surface_outside(run, reopen_log(run), served.field, arm),
+        )
+    return PlanObstacles(
+        served.field,
+        served.ready.model,
+        arm,
+        start,
+        plane=known,
+        measured=surface,
+        space=space,
+        policy=policy,
+    )
 
 
 def check_unknown(served: ServedMap, policy: UnknownPolicy, given: Pose | None) -> None:

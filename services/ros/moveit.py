@@ -87,14 +87,15 @@ class MoveItServices:
             # 0 means "not set" in MoveIt, whose own default is 0.1
             speed = number(request, "max_velocity_scaling_factor") or DEFAULT_SPEED
             acceleration = number(request, "max_acceleration_scaling_factor") or DEFAULT_SPEED
-            around = plan_obstacles(served, robot, base, start)
+            source = margin_source(served, None)
+            around = plan_obstacles(served, robot, base, start, measured=source.audited)
 
             def search(planner: GaussianRRTStar) -> PlanResult:
                 with self._store.searches.running(planner):
                     return planner.plan(start, goal, budget_ms=budget)
 
             found = plan_with_margin(
-                margin_source(served, None),
+                source,
                 lambda margin: GaussianRRTStar(around.field(margin), robot, T_world_base=base, margin=margin),
                 search,
                 start,

@@ -47,6 +47,7 @@ _ANSWER = {
         "base": False,
         "base_proposed": False,
         "support_plane": True,
+        "measured_surface": True,
         "unknown_space": "free",
         "region_points": 5831,
     },
@@ -84,7 +85,9 @@ def plan(request: Request, served: ServedAfterFrames, service: Service, query: _
     )
     check_unknown(served, query.unknown, query.base)
     source = margin_source(served, query.margin)
-    around = plan_obstacles(served, robot, base, start, policy=query.unknown, support=query.support)
+    around = plan_obstacles(
+        served, robot, base, start, policy=query.unknown, support=query.support, measured=source.audited
+    )
 
     def search(planner: GaussianRRTStar) -> PlanResult:
         with service.store.searches.running(planner):

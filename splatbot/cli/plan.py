@@ -88,7 +88,7 @@ def plan(
             `splatbot info --fit-plane`).
         margin: clearance [m] to the map. "auto" is the error of the map's surfaces in the region of the motion, audited
             against the depth of the run (see `splatbot audit`). It is the default in a run folder; the default of a map
-            file is 0.
+            file is 0. "auto" also makes surface an obstacle that two frames measured and the map lacks.
         confidence: share of the confirmed surface that the margin "auto" covers, 0..1.
         unknown: space that no frame of the run saw to be empty is free, or "occupied". With "cautious" it is occupied
             only where two frames looked and measured no depth, as at dark, shiny or transparent objects.
@@ -152,17 +152,22 @@ def plan(
     with steps() as tell:
         tell("loading the map")
         of_map = GaussianCollisionField(model, n_sigma, min_observations=min_observations)
+        keep = "auto" if margin is None and map.is_dir() else margin or "0"
         if unknown != "free":
             tell("searching for unknown space")
         spheres = RobotSpheres(arm, T_world_base=T_world_base)
-        around = map_obstacles(map, of_map, model, spheres, here, unknown=unknown, support=support)
+        if keep == "auto":
+            tell("searching for measured surface outside of the map")
+        around = map_obstacles(
+            map, of_map, model, spheres, here, unknown=unknown, support=support, measured=keep == "auto"
+        )
         found = _plan(
             map,
             of_map,
-            lambda keep: GaussianRRTStar(around.field(keep), arm, T_world_base=T_world_base, margin=keep),
+            lambda least: GaussianRRTStar(around.field(least), arm, T_world_base=T_world_base, margin=least),
             lambda planner: planner.plan(here, wanted, budget_ms=budget_ms, seed=seed),
             here if goal_pose is not None else np.stack([here, wanted]),
-            margin="auto" if margin is None and map.is_dir() else margin or "0",
+            margin=keep,
             confidence=confidence,
             speed=speed,
             tell=tell,
@@ -309,6 +314,10 @@ _SUPPORT = {
     True: "covered within reach, also where no frame saw it",
     False: "NOT COVERED beyond the map: no scene.yaml has it, the base is below it, or --no-support",
 }
+_MEASURED = {
+    True: "covered: points outside of the map that two frames agree on",
+    False: "points that the map lacks are NOT COVERED; --margin auto covers them",
+}
 _UNKNOWN = {
     "free": "not covered: counts as free",
     "cautious": "covered where two frames looked and measured no depth",
@@ -348,6 +357,7 @@ def _print(
             else "not covered: this robot has none; see `splatbot robot list`",
         ),
         ("support plane", _SUPPORT[covers["support_plane"]]),
+        ("measured", _MEASURED[covers["measured_surface"]]),
         ("unknown space", _UNKNOWN[covers["unknown_space"]]),
         ("margin", _margin_text(covers)),
         ("written to", str(folder)),

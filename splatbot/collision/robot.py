@@ -252,6 +252,14 @@ class RobotSpheres:
         return np.ascontiguousarray(rows[exceeds.sum(axis=1) == 1])
 
     @cached_property
+    def reach_radius(self) -> float:
+        """Radius [m] of a ball around the base that contains the arm in every configuration."""
+        last = self.spheres.link == self.spheres.link.max()
+        T = np.eye(4)  # on the last link, as far away as its farthest point
+        T[2, 3] = float((np.linalg.norm(self.spheres.centers[last], axis=1) + self.spheres.radii[last]).max())
+        return self.robot.chain.reach(T)
+
+    @cached_property
     def without_pairs(self) -> RobotSpheres:
         """The same arm without self-collision checks."""
         return RobotSpheres(

@@ -1,4 +1,4 @@
-"""Obstacles of a plan in addition to the map: the support plane beyond its measured part, and unknown space."""
+"""Obstacles of a plan in addition to the map: support plane, measured surface that the map lacks, unknown space."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import torch
 from numpy.typing import ArrayLike
 
 from splatbot.collision import GaussianCollisionField, RobotSpheres, UnknownSpace
+from splatbot.collision.moving import with_balls
 from splatbot.collision.unknown import UnknownPolicy
 from splatbot.errors import SplatbotError
 from splatbot.gaussians import GaussianModel, Snapshot
@@ -19,7 +20,7 @@ from splatbot.protocols import Array
 from splatbot.results.unknown import CONSTANTS as UNKNOWN
 from splatbot.results.unknown import obstacles
 
-Kind = Literal["the map", "the support plane", "unknown space"]
+Kind = Literal["the map", "the support plane", "measured surface", "unknown space"]
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,7 @@ def support_tiles(
     """
     n, d = np.asarray(plane, dtype=np.float64)[:3], float(np.asarray(plane)[3])
     base = arm.T_world_base[:3, 3]
-    height, reach = float(n @ base + d), arm.robot.chain.reach(_last_to_far(arm))
+    height, reach = float(n @ base + d), arm.reach_radius
     if not CONSTANTS.above <= height <= reach:
         return GaussianModel.empty(0)
     R, spacing = frame_along(n), CONSTANTS.spacing
@@ -88,7 +89,7 @@ def support_tiles(
 
 
 class PlanObstacles:
-    """The collision fields of a plan: the map, its support plane, and its unknown space under a policy.
+    """The collision fields of a plan: the map, its support plane, measured surface, and unknown space under a policy.
 
     Args:
         field: collision field of the map.
@@ -96,6 +97,8 @@ class PlanObstacles:
         arm: the arm.
         start: (J,) configuration at which it is [rad or m].
         plane: (4,) support plane of the map, see :func:`support_tiles`. If None, no plane is known or wanted.
+        measured: (M, 4) spheres around measured surface outside of the map [m, world], see
+            :func:`splatbot.results.measured.surface_outside`. If None, it is not known or not wanted.
         space: unknown space of the map. If None, it counts as free.
         policy: treatment of unknown space.
     """
@@ -108,11 +111,15 @@ class PlanObstacles:
         start: ArrayLike,
         *,
         plane: ArrayLike | None = None,
+        measured: Array | None = None,
         space: UnknownSpace | None = None,
         policy: UnknownPolicy = "free",
     ) -> None:
         self._field, self._model, self._arm, self.policy = field, model, arm, policy
         self._start, self._plane, self._space = np.asarray(start), plane, space
+        self.covers_measured = measured is not None
+        spheres = np.zeros((0, 4)) if measured is None else measured
+        self._measured = with_balls(GaussianModel.empty(0), spheres, n_sigma=field.n_sigma, observations=_ALWAYS)
         self._tiles, self._solids = 0, GaussianModel.empty(0)
 
     @property
@@ -139,7 +146,7 @@ class PlanObstacles:
         if self._plane is not None:
             tiles = support_tiles(self._plane, self._arm, self._start, margin=margin, n_sigma=self._field.n_sigma)
         self._tiles = len(tiles)
-        solids = GaussianModel.concatenate([tiles, self._unknown(margin)])
+        solids = GaussianModel.concatenate([tiles, self._measured, self._unknown(margin)])
         self._solids = solids
         if not len(solids):
             return self._field
@@ -151,21 +158,21 @@ class PlanObstacles:
     def unknown_field(self, margin: float) -> GaussianCollisionField | None:
         """Return the field of unknown space alone for plans with a margin [m], or None if it counts as free."""
         solids = self._unknown(margin)
-        return GaussianCollisionField(solids) if len(solids) else None
+        return GaussianCollisionField(solids, self._field.n_sigma) if len(solids) else None
 
     def _unknown(self, margin: float) -> GaussianModel:
         if self._space is None:
             return GaussianModel.empty(0)
-        return obstacles(self._space, self.policy, self._arm, self._start, margin=margin)
+        return obstacles(self._space, self.policy, self._arm, self._start, margin=margin, n_sigma=self._field.n_sigma)
 
     def kind(self, gaussian: int) -> Kind:
         """Return the kind of obstacle of a row in the latest field."""
-        if gaussian < len(self._model):
-            return "the map"
-        return "the support plane" if gaussian < len(self._model) + self._tiles else "unknown space"
+        counts = (len(self._model), self._tiles, len(self._measured))
+        kinds: tuple[Kind, ...] = ("the map", "the support plane", "measured surface", "unknown space")
+        return kinds[int(np.searchsorted(np.cumsum(counts), gaussian, side="right"))]
 
     def check(self, result: PlanResult) -> None:
-        """Check that neither support plane nor unknown space makes start or goal of a plan invalid.
+        """Check that no obstacle outside of the map makes start or goal of a plan invalid.
 
         Raises:
             UnmappedObstacleError: one does; the message names the link, the obstacle and the place.
@@ -177,12 +184,17 @@ class PlanObstacles:
         kind = self.kind(cause.gaussian)
         if kind == "the map":
             return
-        what = _MEANINGS[self.policy] if kind == "unknown space" else "the support plane of the scene.yaml"
+        meanings = {
+            "unknown space": _MEANINGS[self.policy],
+            "the support plane": "the support plane of the scene.yaml",
+            "measured surface": "surface that two frames measured and the map lacks",
+        }
         hints = {
             "unknown space": "map the place from more views, give another goal, or let unknown space be free",
             "the support plane": "give another goal, correct the plane in scene.yaml, or leave it out (`--no-support`)",
+            "measured surface": "map again with a mask of the robot, or give the margin in metres, which does not cover it",
         }
-        raise UnmappedObstacleError(f"{cause.deep_in(what)}.", field=ends[result.status], hint=hints[kind])
+        raise UnmappedObstacleError(f"{cause.deep_in(meanings[kind])}.", field=ends[result.status], hint=hints[kind])
 
 
 _ALWAYS = 1 << 30  # observations of solids
@@ -194,14 +206,6 @@ _MEANINGS = {
 
 
 class UnmappedObstacleError(SplatbotError):
-    """The start or the goal of a plan is in the support plane or in unknown space."""
+    """The start or the goal of a plan is in an obstacle that is not in the map."""
 
     http_status = 422
-
-
-def _last_to_far(arm: RobotSpheres) -> Array:
-    """Return a pose (4, 4) on the last link whose distance is that of its farthest point."""
-    last = arm.spheres.link == arm.spheres.link.max()
-    T = np.eye(4)
-    T[2, 3] = float((np.linalg.norm(arm.spheres.centers[last], axis=1) + arm.spheres.radii[last]).max())
-    return T

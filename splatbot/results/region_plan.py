@@ -72,6 +72,7 @@ class RegionPlan:
             "hand": isinstance(robot, HasHand) and robot.hand is not None,
             "base_in_map": self.planner.arm.base_in_map_above(self.planner.field, CONSTANTS.base_foot),
             "support_plane": around.covers_support,
+            "measured_surface": around.covers_measured,
             "unknown_space": around.policy,
             "margin_m": margin,
             "margin_from": "audit" if audited else "user" if margin > 0 else "none",

@@ -51,7 +51,13 @@ def unknown_in_reach(run: RunFolder, log: Log, arm: RobotSpheres) -> UnknownSpac
 
 
 def obstacles(
-    space: UnknownSpace, policy: UnknownPolicy, arm: RobotSpheres, occupied: ArrayLike, *, margin: float = 0.0
+    space: UnknownSpace,
+    policy: UnknownPolicy,
+    arm: RobotSpheres,
+    occupied: ArrayLike,
+    *,
+    margin: float = 0.0,
+    n_sigma: float = 2.0,
 ) -> GaussianModel:
     """Return the solids of unknown space under a policy, without the volume of the arm where it is known to be.
 
@@ -65,7 +71,8 @@ def obstacles(
         occupied: (C, J) configurations at which the arm is or was [rad or m].
         margin: clearance that a plan keeps [m]. Solids within it of the arm are left out too, because a plan could not
             start there.
+        n_sigma: surface of the solids, in standard deviations.
     """
     q = np.atleast_2d(np.asarray(occupied, dtype=np.float64))
     centers, radii = arm.centers(q).reshape(-1, 3), np.tile(arm.spheres.radii + margin + CONSTANTS.slack, len(q))
-    return space.without(np.c_[centers, radii]).solids(policy=policy)
+    return space.without(np.c_[centers, radii]).solids(n_sigma, policy=policy)

@@ -69,6 +69,7 @@ def test_the_default_margin_of_a_recorded_map_is_its_audited_error(service: Serv
     assert answer["margin_source"] == "audited error of the map where the arm moves"
     covers = answer["covers"]
     assert (covers["margin_from"], covers["unknown_space"], covers["base"]) == ("audit", "free", False)
+    assert covers["measured_surface"]
     assert covers["region_points"] == 1000  # far from all points, so that the nearest count
     assert 0.0 < covers["region_error_m"] <= answer["margin_m"] * (1 + 1e-9)
     error = audited_error(recorded, reopen_log(RunFolder(recorded)), service.store.get("table").field)
@@ -83,6 +84,7 @@ def test_a_given_margin_is_kept_and_stated(service: Service) -> None:
     assert answer["margin_m"] == 0.012
     assert answer["margin_source"] == "given"
     assert (answer["covers"]["margin_from"], answer["covers"]["region_points"]) == ("user", None)
+    assert not answer["covers"]["measured_surface"]
     zero = plan(service, "table", margin=0).json()
     assert (zero["margin_m"], zero["margin_source"]) == (0.0, "given")
 

@@ -96,16 +96,24 @@ def test_kinds_of_obstacles_are_told_apart_in_a_map_with_harmonics() -> None:
     space = block((40, 40, 40), np.array([0.3, -0.4, 0.1]))
     up = np.array([0.0, 0.0, 1.0, 0.0])
     around = PlanObstacles(
-        GaussianCollisionField(rich), rich, arm, robot.home, plane=up, space=space, policy="occupied"
+        GaussianCollisionField(rich),
+        rich,
+        arm,
+        robot.home,
+        plane=up,
+        measured=np.array([[1.0, 2.0, 3.0, 0.01], [2.0, 2.0, 3.0, 0.01]]),
+        space=space,
+        policy="occupied",
     )
     assert not around.covers_support
     field = around.field(MARGIN)
     assert around.covers_support
     assert len(field) > len(rich) + 1000
     tiles = len(support_tiles(up, arm, robot.home, margin=MARGIN))
-    assert [around.kind(k) for k in (0, len(rich) - 1, len(rich), len(rich) + tiles - 1, len(rich) + tiles)] == [
-        "the map", "the map", "the support plane", "the support plane", "unknown space",
-    ]  # fmt: skip
+    assert {around.kind(k) for k in (0, len(rich) - 1)} == {"the map"}
+    assert {around.kind(len(rich) + k) for k in (0, tiles - 1)} == {"the support plane"}
+    assert {around.kind(len(rich) + tiles + k) for k in (0, 1)} == {"measured surface"}
+    assert {around.kind(len(rich) + tiles + k) for k in (2, 3)} == {"unknown space"}
     plain = PlanObstacles(GaussianCollisionField(rich), rich, arm, robot.home)
     assert len(plain.field(MARGIN)) == len(rich)
     assert CONSTANTS.radius > CONSTANTS.spacing / np.sqrt(2)
@@ -149,3 +157,22 @@ def test_a_goal_in_unknown_space_is_named(policy: str, words: str) -> None:
     result = GaussianRRTStar(around.field(MARGIN), robot, margin=MARGIN).plan(robot.home, goal, budget_ms=50)
     with pytest.raises(SplatbotError, match=words):
         around.check(result)
+
+
+@pytest.mark.parametrize("n_sigma", [1.0, 2.0, 3.0])
+def test_obstacles_outside_of_the_map_have_their_size_at_any_sigma(n_sigma: float) -> None:
+    model = tabletop().gaussians(2000)
+    home, arm = load_robot("panda").home, RobotSpheres(load_robot("panda"))
+    space = block((12, 12, 12), np.array([0.4, 1.0, 2.0]))
+    ball = np.array([[2.0, 3.0, 4.0, 0.004]])
+    around = PlanObstacles(
+        GaussianCollisionField(model, n_sigma), model, arm, home, measured=ball, space=space, policy="occupied"
+    )
+    field = around.field(0.0)
+    beside_ball, below_block = np.array([2.0, 3.0, 4.03]), space.origin + 0.02 * np.array([6.5, 6.5, -1.5])
+    gap = field.clearance(np.stack([beside_ball, below_block]), cut=1.0).distance
+    corner = np.sqrt(3) / 2 * space.voxel  # radius of the sphere around the voxel 6, 6, 1
+    np.testing.assert_allclose(gap, [0.026, 3 * space.voxel - corner], atol=1e-4)
+    alone = around.unknown_field(0.0)
+    assert alone is not None
+    np.testing.assert_allclose(alone.clearance(below_block[None], cut=1.0).distance, gap[1:], atol=1e-5)
