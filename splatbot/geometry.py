@@ -107,10 +107,15 @@ def transform_points(T_a_b: ArrayLike, points_b: ArrayLike) -> Array:
     return np.asarray(points_b, dtype=np.float64) @ M[:3, :3].T + M[:3, 3]
 
 
-def look_at(eye: Array, target: Array) -> Array:
-    """Return T_world_camera (4, 4) of an upright camera (world z is up) at ``eye`` (3,), facing ``target`` (3,) [m]."""
+def look_at(eye: Array, target: Array, *, up: ArrayLike = (0.0, 0.0, 1.0)) -> Array:
+    """Return T_world_camera (4, 4) of an upright camera at ``eye`` (3,), facing ``target`` (3,) [m].
+
+    Args:
+        eye, target: two points whose line is not along ``up``.
+        up: (3,) direction that is up in the image.
+    """
     forward = (target - eye) / np.linalg.norm(target - eye)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right = np.cross(forward, np.asarray(up, dtype=np.float64))
     right /= np.linalg.norm(right)
     T = np.eye(4)
     T[:3, :3] = np.column_stack([right, np.cross(forward, right), forward])

@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any, NamedTuple, TextIO
 
+from splatbot.cli.loading import ERASE, imports_shown
 from splatbot.cli.messages import interruption, print_message, set_interruption
 
 
@@ -129,7 +130,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(__version__)
         return 0
     try:
-        with _interrupts_while_libraries_load():
+        with _interrupts_while_libraries_load(), imports_shown():
             return int(_dispatch(words) or 0)
     except SplatbotError as error:
         if debug:
@@ -175,7 +176,7 @@ def _interrupts_while_libraries_load() -> Iterator[None]:
 def _on_interrupt(number: int, frame: FrameType | None) -> None:
     while frame is not None:
         if frame.f_code.co_filename.startswith("<frozen importlib"):
-            os.write(2, f"{interruption()}\n".encode())
+            os.write(2, f"{ERASE if os.isatty(2) else ''}{interruption()}\n".encode())
             os._exit(130)
         frame = frame.f_back
     raise KeyboardInterrupt

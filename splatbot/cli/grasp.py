@@ -62,6 +62,7 @@ def grasp(
         splatbot grasp --map runs/latest --target "largest box"
         splatbot grasp --map runs/latest --target "red cup" --approach top
         splatbot grasp --map runs/latest --pixel 320 210 --index 12
+        splatbot grasp --map runs/latest --box 280 180 360 260 --index 12
         splatbot grasp --map runs/latest --mask a.png b.png c.png --index 0 20 40
         SPLATBOT_VLM_URL=http://127.0.0.1:8000/v1 SPLATBOT_VLM_MODEL=qwen splatbot grasp --map runs/a --target mug --vlm
         splatbot grasp --map map.ply --base 0 0.4 0 0.7071 -0.7071 0 0 --point 0.1 0.2 0.6 --hand-only

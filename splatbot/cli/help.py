@@ -10,18 +10,28 @@ import sys
 import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
-from typing import Annotated, Any, get_type_hints
+from itertools import takewhile
+from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 import tyro
 
+from splatbot.errors import InputError
+
 _COLUMNS = 120  # widest text of a help
 _BLANK_ROW, _ESCAPES = re.compile(r"│\s+│"), re.compile(r"\x1b\[[0-9;]*m")
+_HELP = {"-h", "--help"}
 _LARGE = 1e6  # defaults from here on have exponents
 _ON = "(on by default; this option turns it off)"
 
 
 def parsed(documented: Callable[..., Any], program: str, words: Sequence[str]) -> Any:
-    """Call a command, or make a dataclass, with the options of a command line; print the help and exit on --help."""
+    """Call a command, or make a dataclass, with the options of a command line; print the help and exit on --help.
+
+    Raises:
+        InputError: an option of several numbers, as a pose, has too few or too many of them.
+    """
+    if not _HELP & set(words):
+        _check_numbers(documented, words)
     with fitted_help(words):
         return tyro.cli(
             explained(documented),
@@ -30,6 +40,51 @@ def parsed(documented: Callable[..., Any], program: str, words: Sequence[str]) -
             args=list(words),
             config=(tyro.conf.FlagCreatePairsOff,),
         )
+
+
+def _check_numbers(documented: Callable[..., Any], words: Sequence[str]) -> None:
+    """Check the options of several numbers, of which tyro prints the names of its types.
+
+    Raises:
+        InputError: one has another number of values, or values that are no numbers.
+    """
+    for name, hint in get_type_hints(documented, include_extras=True).items():
+        count, flag = _count_of(hint), f"--{name.replace('_', '-')}"
+        if count == 0 or flag not in words:
+            continue
+        values = list(
+            takewhile(lambda word: _is_number(word) or not word.startswith("-"), words[words.index(flag) + 1 :])
+        )
+        wrong = next((value for value in values if not _is_number(value)), None)
+        if len(values) == count and wrong is None:
+            continue
+        metavar = next((found for part in hint.__metadata__ if (found := getattr(part, "metavar", None))), "")
+        examples = re.findall(rf"{flag}((?: [-+.\deE]+){{{count}}})(?= |$)", documented.__doc__ or "", re.MULTILINE)
+        example = f", as in {flag}{examples[0]}" if examples else ""
+        has = (
+            f"has {len(values)} values, not {count}." if len(values) != count else f"has {wrong!r}, which is no number."
+        )
+        raise InputError(has, field=flag, hint=f"give {count} numbers, {metavar}{example}")
+
+
+def _count_of(hint: Any) -> int:
+    """Return the count of numbers of an option whose type is a tuple of that many floats, else 0."""
+    if get_origin(hint) is not Annotated:
+        return 0
+    (declared, *_) = get_args(hint)
+    for part in (declared, *get_args(declared)):
+        kinds = get_args(part) if get_origin(part) is tuple else ()
+        if kinds and set(kinds) == {float}:
+            return len(kinds)
+    return 0
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
 
 
 def explained(documented: Callable[..., Any]) -> Callable[..., Any]:
@@ -108,7 +163,7 @@ def _continued(line: str, width: int) -> str:
 @contextmanager
 def fitted_help(words: Sequence[str]) -> Iterator[None]:
     """Wrap the usage of a help, which tyro prints in one line, to the terminal."""
-    if not {"-h", "--help"} & set(words):
+    if not _HELP & set(words):
         yield
         return
     text = _Held()

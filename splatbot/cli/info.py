@@ -61,6 +61,7 @@ def info(
         splatbot info runs/latest
         splatbot info map.ply
         splatbot info runs/latest --fit-plane
+        splatbot info runs/latest --fit-plane --up 0 -1 0
         splatbot info runs/latest --fit-plane --base-offset -0.2 0.4 0.6
 
     Args:

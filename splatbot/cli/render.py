@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -22,7 +23,11 @@ if TYPE_CHECKING:
 
 _LONGEST_VIDEO_S = 600.0
 
+_LEAST_SINE = 1e-3  # of the angle between a view and up, below which no horizon is defined
+_UP = (0.0, -1.0, 0.0)
+
 Pose = tuple[float, float, float, float, float, float, float]
+Point = tuple[float, float, float]
 
 
 def render(
@@ -31,6 +36,8 @@ def render(
     mode: Literal["rgb", "depth", "normal", "alpha"] = "rgb",
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
     pose: Annotated[Pose | None, tyro.conf.arg(metavar="X Y Z QW QX QY QZ")] = None,
+    look_from: Annotated[Point | None, tyro.conf.arg(metavar="X Y Z")] = None,
+    look_at: Annotated[Point | None, tyro.conf.arg(metavar="X Y Z")] = None,
     trajectory: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
     index: Annotated[int | None, tyro.conf.arg(metavar="I")] = None,
     size: Annotated[str, tyro.conf.arg(metavar="WxH")] = "640x480",
@@ -49,6 +56,7 @@ def render(
         splatbot render runs/latest
         splatbot render map.ply --mode depth --out depth.png --size 1280x720
         splatbot render map.ply --pose 0 0 -1.5 1 0 0 0
+        splatbot render runs/latest --look-from 0.8 -0.6 -0.2 --look-at 0 0 1
         splatbot render runs/latest --index 30 --mode normal
         splatbot render runs/latest --video fly.mp4 --seconds 10
 
@@ -57,6 +65,9 @@ def render(
         mode: colour, depth, surface normals or opacity.
         out: PNG to write; by default NAME-MODE.png here.
         pose: T_world_camera: position [m] and quaternion (w x y z); camera axes x right, y down, z forward.
+        look_from: place of the camera instead of --pose [m]. The frame is that of the map: its first camera's, with x right,
+            y down, z forward. The camera is upright, by the scene.yaml next to the map if there is one.
+        look_at: point in the middle of the image [m], in the same frame.
         trajectory: TUM file to take the pose from, with --index. A run folder brings its own.
         index: which pose of the trajectory, from 0; -1 is the last.
         size: width and height of the image [px].
@@ -76,13 +87,16 @@ def render(
     check_output(out, folder=False)
     check_output(video, folder=False)
     if video is not None:
-        _check_video(path, seconds, pose=pose, index=index, out=out)
+        _check_video(path, seconds, pose=pose or look_from or look_at, index=index, out=out)
+    looking = _looking(
+        map_, look_from, look_at, excluded={"--pose": pose, "--trajectory": trajectory, "--index": index}
+    )
 
     from splatbot.atomic import atomic_write
     from splatbot.gaussians import GaussianModel
     from splatbot.rasterize.views import default_view, render_view, to_png
 
-    given = _given_pose(pose, path, index) if video is None else None
+    given = looking if looking is not None else _given_pose(pose, path, index) if video is None else None
     if is_tiled:
         model, camera, T_world_camera = _load_view(file, given, (width, height, fov), pixel_error, memory_mb)
     else:
@@ -127,7 +141,9 @@ def _own_trajectory(path: Path, index: int | None, video: Path | None) -> Path |
     return path / "trajectory.tum" if path.is_dir() and (index is not None or video is not None) else None
 
 
-def _check_video(path: Path | None, seconds: float, *, pose: Pose | None, index: int | None, out: Path | None) -> None:
+def _check_video(
+    path: Path | None, seconds: float, *, pose: Pose | Point | None, index: int | None, out: Path | None
+) -> None:
     """Refuse a video without a path, or with options of a single view.
 
     Raises:
@@ -135,7 +151,7 @@ def _check_video(path: Path | None, seconds: float, *, pose: Pose | None, index:
     """
     from splatbot.errors import InputError
 
-    for name, value in (("--pose", pose), ("--index", index), ("--out", out)):
+    for name, value in (("--pose, --look-from", pose), ("--index", index), ("--out", out)):
         if value is not None:
             raise InputError("is for a single view.", field=name, hint="leave it out, or leave --video out")
     if path is None:
@@ -169,6 +185,53 @@ def _parse_size(text: str) -> tuple[int, int]:
     if not match or not all(1 <= int(part) <= 16384 for part in match.groups()):
         raise InputError(f"is {text!r}.", field="--size", hint="write WIDTHxHEIGHT in pixels, as in 640x480")
     return int(match[1]), int(match[2])
+
+
+def _looking(
+    map_: Path, look_from: Point | None, look_at: Point | None, *, excluded: Mapping[str, object]
+) -> NDArray[np.float64] | None:
+    """Return T_world_camera (4, 4) of an upright camera at a point that faces another, None without both.
+
+    Raises:
+        InputError: one of them is missing, not finite or the other, or the camera looks straight up or down.
+    """
+    from splatbot.errors import InputError
+
+    if look_from is None and look_at is None:
+        return None
+    for name, value in excluded.items():
+        if value is not None:
+            raise InputError("excludes --look-from and --look-at.", field=name, hint="give the one or the others")
+    if look_from is None or look_at is None:
+        missing, known = ("--look-from", "--look-at") if look_from is None else ("--look-at", "--look-from")
+        raise InputError(f"is missing next to {known}.", field=missing, hint=f"give it too: {missing} X Y Z, in metres")
+
+    import numpy as np
+
+    from splatbot.geometry import look_at as facing
+    from splatbot.workspace import find_workspace
+
+    for flag, point in (("--look-from", look_from), ("--look-at", look_at)):
+        if not np.isfinite(point).all():
+            where = " ".join(f"{value:g}" for value in point)
+            raise InputError(f"is {where}.", field=flag, hint="give finite numbers, in metres")
+    scene, up = find_workspace(map_), np.array(_UP)
+    if scene is not None and scene.gravity is not None:
+        up = -scene.gravity
+    elif scene is not None and scene.T_world_base is not None:
+        up = scene.T_world_base[:3, 2]
+    view = np.subtract(look_at, look_from)
+    length = float(np.linalg.norm(view))
+    if length == 0.0:
+        raise InputError(
+            "is the point of --look-from.", field="--look-at", hint="give another point, ahead of the camera"
+        )
+    if float(np.linalg.norm(np.cross(view / length, up))) < _LEAST_SINE:
+        hint = "move --look-from to one side, by a hundredth of the distance, or give --pose"
+        raise InputError(
+            "is straight above or below --look-from, so that no side of the image is up.", field="--look-at", hint=hint
+        )
+    return facing(np.array(look_from), np.array(look_at), up=up)
 
 
 def _given_pose(pose: Pose | None, path: Path | None, index: int | None) -> NDArray[np.float64] | None:

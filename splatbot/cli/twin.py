@@ -52,6 +52,7 @@ def twin(
         splatbot twin --scene wiping --forbid backlash --json result.json
         splatbot twin --map runs/latest --trajectory runs/plan/trajectory.json
         splatbot twin --map runs/latest --robot ur5e-2f85 --trajectory runs/plan/trajectory.json --video ur5e.mp4
+        splatbot twin --map map.ply --base 0 0.4 0 0.7071 -0.7071 0 0 --trajectory runs/plan/trajectory.json
         splatbot twin --scene my_scene.yaml --seed 3
 
     Args:

@@ -14,9 +14,12 @@ import pytest
 
 from splatbot.cli import checks
 from splatbot.evaluation import depth_offset
+from splatbot.gaussians import GaussianModel
+from splatbot.geometry import pose_from_quat
 from splatbot.logs import open_log
 from splatbot.logs.record import record
 from splatbot.trajectory import Trajectory
+from splatbot.workspace import Workspace
 from tests.unit.cli.conftest import RunCommand, assert_fix_named
 
 
@@ -113,6 +116,59 @@ def test_render_takes_a_pose_by_hand_or_by_index(run: RunCommand, run_folder: Pa
 )
 def test_render_refuses_what_it_cannot_draw(run: RunCommand, run_folder: Path, words: list[str], field: str) -> None:
     assert_fix_named(run("render", run_folder, *words), field)
+
+
+@pytest.mark.parametrize(
+    ("known", "up"),
+    [
+        (None, (0.0, -1.0, 0.0)),
+        (Workspace(gravity=np.array([0.6, 0.0, -0.8])), (-0.6, 0.0, 0.8)),
+        (Workspace(T_world_base=pose_from_quat((0, 0, 0), (0.5, 0.5, 0.5, 0.5))), (1.0, 0.0, 0.0)),
+    ],
+)
+def test_render_from_a_point_shows_the_other_point_in_the_middle_and_up_as_up(
+    run: RunCommand, tmp_path: Path, known: Workspace | None, up: tuple[float, ...]
+) -> None:
+    eye, at = np.array([0.7, -0.4, 0.2]), np.array([0.1, 0.2, 1.1])
+    balls = np.stack([at, at + 0.2 * np.array(up)])
+    GaussianModel.from_activated(
+        means=balls,
+        quats=np.tile([1.0, 0, 0, 0], (2, 1)),
+        scales=np.full((2, 3), 0.01),
+        opacities=np.full(2, 0.99),
+        colors=np.eye(3)[:2],  # red, and green above it
+    ).save(tmp_path / "map.ply")
+    if known is not None:
+        known.save(tmp_path / "scene.yaml")
+    words = ("--look-from", *eye, "--look-at", *at, "--size", "161x121", "--out", tmp_path / "view.png")
+    answer = run("render", tmp_path / "map.ply", *words)
+    assert answer.code == 0, answer.err
+    image = cv2.imread(str(tmp_path / "view.png"))
+    assert image is not None
+    (v, u), (v_up, u_up) = (np.argwhere(image[..., k] > 128).mean(axis=0) for k in (2, 1))
+    np.testing.assert_allclose((u, v), (80, 60), atol=1.0)
+    assert v_up < v - 3
+    assert abs(u_up - u) < 2.0
+
+
+@pytest.mark.parametrize(
+    ("words", "mistake"),
+    [
+        (("--look-from", 0, 0, 0), "--look-at: is missing next to --look-from"),
+        (("--look-at", 0, 0, 0), "--look-from: is missing next to --look-at"),
+        (("--look-from", 1, 2, 3, "--look-at", 1, 2, 3), "--look-at: is the point of --look-from"),
+        (("--look-from", 0, 0, "nan", "--look-at", 1, 2, 3), "--look-from: is 0 0 nan"),
+        (("--look-from", 0, 0, 0, "--look-at", 1, "inf", 3), "--look-at: is 1 inf 3"),
+        (("--look-from", 0, -2, 1, "--look-at", 0, 0, 1), "--look-at: is straight above or below --look-from"),
+        (("--look-from", 0, 0, 0, "--look-at", 0, 0, 1, "--index", 1), "--index: excludes --look-from and --look-at"),
+        (("--look-from", 0, 0, 0, "--look-at", 0, 0, 1, "--video", "a.mp4"), "--look-from: is for a single view"),
+    ],
+)
+def test_render_refuses_a_view_that_is_not_defined(
+    run: RunCommand, run_folder: Path, work_folder: Path, words: tuple[object, ...], mistake: str
+) -> None:
+    assert_fix_named(run("render", run_folder, *words), mistake)
+    assert not list(work_folder.iterdir())
 
 
 @pytest.mark.parametrize("mode", ["rgb", "depth", "alpha"])
