@@ -111,7 +111,7 @@ def test_masked_pixels_are_no_obstacle(mapped: tuple[RunFolder, GaussianModel, R
 
 @pytest.mark.parametrize("voxel", [0.003, 0.02])
 def test_one_sphere_encloses_the_points_of_each_voxel(voxel: float, rng: np.random.Generator) -> None:
-    points = rng.normal(0.0, 0.05, (4000, 3))
+    points = rng.normal(0.0, 0.05, (1000, 3))
     points[:50] = points[0]
     spheres = enclosing_spheres(points, voxel, 0.001)
     cells = np.floor(points / voxel).astype(int)
