@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -11,8 +10,7 @@ import numpy as np
 
 from splatbot.imu import ImuSamples
 from splatbot.protocols import Array
-
-_log = logging.getLogger(__name__)
+from splatbot.robots.cameras.imu_buffer import factory_axes, warn_of_unused_imu
 
 
 @dataclass(frozen=True)
@@ -98,15 +96,7 @@ def factory_rotation(device: Any) -> Array | None:
         return None
     try:
         T = device.readCalibration().getImuToCameraExtrinsics(depthai.CameraBoardSocket.CAM_A)
-        R = np.array(T, np.float64)[:3, :3]
-    except (RuntimeError, IndexError) as error:  # depthai raises the former where a link is missing
-        _warn_of(str(error))
+        return factory_axes(np.array(T, np.float64)[:3, :3])
+    except (RuntimeError, IndexError, ValueError) as error:  # depthai raises RuntimeError where a link is missing
+        warn_of_unused_imu("the OAK", f"its axes are not calibrated ({error})")
         return None
-    if not np.allclose(R @ R.T, np.eye(3), atol=1e-3) or np.linalg.det(R) < 0:
-        _warn_of("the matrix is no rotation")
-        return None
-    return R
-
-
-def _warn_of(reason: str) -> None:
-    _log.warning("the IMU of the OAK is not used: its axes are not calibrated (%s)", reason)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -15,13 +16,22 @@ from splatbot.logs.undistort import modified_source_pixels
 from splatbot.robots.cameras.device import CONSTANTS as DEVICE
 from splatbot.robots.cameras.device import ImageLens, RgbdDevice
 from splatbot.robots.cameras.realsense_align import aligns_with_lens
+from splatbot.robots.cameras.realsense_imu import open_imu
 from splatbot.robots.cameras.stream_options import StreamOptions, parse_address
 
 DEFAULT = StreamOptions(width=640, height=480)
 
 
 class FrameSets(Protocol):
-    """Synchronized images of a device."""
+    """Synchronized images of a device.
+
+    Attributes:
+        color: stream profile of colour.
+        motion: sensor of the gyroscope and the accelerometer, not open yet; None for a device without one.
+    """
+
+    color: Any
+    motion: Any
 
     def wait(self, milliseconds: int) -> Any:
         """Return the next set with colour and depth, or None after a time without one."""
@@ -43,7 +53,7 @@ class RealsenseCamera(RgbdDevice):
     """A RealSense camera as a source of frames; each iteration opens the device.
 
     Stamps of librealsense in global or system time are Unix time. Those of the device's own clock are shifted to Unix
-    time by the first image.
+    time by the first image that has it. Frames have the samples of the IMU, if there is one.
 
     Args:
         serial: serial number; empty takes the first device.
@@ -78,22 +88,28 @@ class RealsenseCamera(RgbdDevice):
         except RuntimeError as error:
             hint = "plug it into a USB 3 port; `rs-enumerate-devices` lists its sizes and rates, and its serial number"
             raise self._cannot_be_opened(error, hint) from error
+        imu = open_imu(streams.motion, streams.color, self.uri)
         try:
             align = rs.align(rs.stream.color)
-            shift: float | None = None
+            shift: float | None = None  # [s] from the clock of the device to Unix time
             poll_ms = round(1e3 * DEVICE.poll_s)
             for pair in self._pairs(lambda: streams.wait(poll_ms), _number_of):
                 aligned = align.process(pair)
                 color, depth = aligned.get_color_frame(), aligned.get_depth_frame()
                 at, depth_at = (1e-3 * image.get_timestamp() for image in (color, depth))
                 clock, depth_clock = (image.get_frame_timestamp_domain() for image in (color, depth))
-                if shift is None:
-                    shift = time.time() - at if clock == rs.timestamp_domain.hardware_clock else 0.0
+                of_device = clock == rs.timestamp_domain.hardware_clock
+                if of_device and shift is None:
+                    shift = time.time() - at
+                stamp = at + shift if of_device and shift is not None else at
                 rgb = np.array(color.get_data())  # a copy: the buffer belongs to librealsense
                 metres = np.asanyarray(depth.get_data()).astype(np.float32) * np.float32(depth.get_units())
                 delay = depth_at - at if clock == depth_clock else 0.0
-                yield self._next_frame(shift + at, rgb, metres, self._lenses(rs, color), delay)
+                frame = self._next_frame(stamp, rgb, metres, self._lenses(rs, color), delay)
+                yield frame if imu is None else replace(frame, imu=imu.until(stamp, shift))
         finally:
+            if imu is not None:
+                imu.stop()
             streams.stop()
 
     def _lenses(self, rs: Any, color: Any) -> tuple[ImageLens, ImageLens]:
@@ -139,7 +155,9 @@ class DeviceStreams:
             config.enable_device(serial)
         for stream, kind in ((rs.stream.color, rs.format.rgb8), (rs.stream.depth, rs.format.z16)):
             config.enable_stream(stream, options.width, options.height, kind, round(options.fps))
-        self._pipeline.start(config)
+        profile = self._pipeline.start(config)
+        self.color = profile.get_stream(rs.stream.color)
+        self.motion = next((s for s in profile.get_device().query_sensors() if s.is_motion_sensor()), None)
 
     def wait(self, milliseconds: int) -> Any:
         """Implement :meth:`FrameSets.wait`."""

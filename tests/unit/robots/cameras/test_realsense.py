@@ -5,7 +5,8 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from itertools import islice
+from dataclasses import dataclass, field
+from itertools import islice, pairwise
 from typing import Any
 
 import cv2
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from splatbot.errors import DeviceError, InputError
 from splatbot.frame import Frame
+from splatbot.geometry import so3_exp
 from splatbot.protocols import Array
 from splatbot.robots.cameras import RealsenseCamera, device, open_camera
 from splatbot.robots.cameras.stream_options import StreamOptions
@@ -33,6 +35,56 @@ def intrinsics(fx: float, model: Any, coefficients: tuple[float, ...]) -> Any:
     return made
 
 
+@dataclass
+class Imu:
+    """A motion sensor of a software device; each sample holds its own time [s] in its first component.
+
+    Args:
+        domain: clock of the stamps.
+        R: (3, 3) axes of the sensors in those of colour; None where they are not known.
+        rates: [Hz] of the gyroscope and the accelerometer; 0 leaves one out.
+    """
+
+    domain: Any = None
+    R: Array | None = field(default_factory=lambda: so3_exp([0.4, -1.1, 0.6]))
+    rates: tuple[int, int] = (200, 100)
+    sent: dict[Any, int] = field(default_factory=dict)
+
+    def add_to(self, device: Any, color: Any) -> Any:
+        """Return the sensor, which a driver may open."""
+        self._sensor, self._profiles = device.add_sensor("Motion Module"), []
+        for uid, (stream, rate) in enumerate(zip((rs.stream.gyro, rs.stream.accel), self.rates, strict=True), 5):
+            for other in (2 * rate, rate) if rate else ():  # D400 offer several rates
+                motion = rs.motion_stream()
+                motion.type, motion.index, motion.uid, motion.fps = stream, 0, 10 * uid + (other > rate), other
+                motion.fmt, motion.intrinsics = rs.format.motion_xyz32f, rs.motion_device_intrinsic()
+                profile = self._sensor.add_motion_stream(motion)
+                if self.R is not None:
+                    turn = rs.extrinsics()
+                    turn.rotation, turn.translation = self.R.T.ravel().tolist(), [0.1, 0.2, 0.3]
+                    np.testing.assert_allclose(  # librealsense itself turns by these columns
+                        rs.rs2_transform_point_to_point(turn, [1.0, 2.0, 3.0]),
+                        self.R @ [1, 2, 3] + [0.1, 0.2, 0.3],
+                        atol=1e-6,
+                    )
+                    profile.register_extrinsics_to(color, turn)
+            if rate:
+                self._profiles.append((stream, profile, rate))
+        return self._sensor
+
+    def send(self, until: float) -> None:
+        """Send the samples up to a time [s]."""
+        for stream, profile, rate in self._profiles:
+            while (number := self.sent.get(stream, 0)) / rate <= until:
+                frame, vector = rs.software_motion_frame(), rs.vector()
+                vector.x, vector.y, vector.z = number / rate, -1.0, 0.5 if stream == rs.stream.gyro else 2.0
+                frame.data, frame.timestamp, frame.frame_number = vector, 1000 * number / rate, number
+                frame.domain = self.domain or rs.timestamp_domain.hardware_clock
+                frame.profile = profile.as_motion_stream_profile()
+                self._sensor.on_motion_frame(frame)
+                self.sent[stream] = number + 1
+
+
 class SoftwareStreams:
     """Streams of a software device that sends images of colour and depth from a thread."""
 
@@ -45,8 +97,9 @@ class SoftwareStreams:
         baseline: float = 0.0,
         domain: Any = None,
         missing: tuple[int, ...] = (),
+        imu: Imu | None = None,
     ) -> None:
-        self._images, self._missing = images, missing
+        self._images, self._missing, self._imu = images, missing, imu
         self._domain = domain or rs.timestamp_domain.hardware_clock
         self._device = rs.software_device()
         self._profiles = []
@@ -64,6 +117,8 @@ class SoftwareStreams:
         moved = rs.extrinsics()
         moved.rotation, moved.translation = [1, 0, 0, 0, 1, 0, 0, 0, 1], [baseline, 0, 0]
         self._profiles[0][1].register_extrinsics_to(self._profiles[1][1], moved)
+        self.color = self._profiles[1][1]
+        self.motion = None if imu is None else imu.add_to(self._device, self.color)
         self._device.create_matcher(rs.matchers.default)
         self._pairs = rs.syncer(16)
         for sensor, profile, _ in self._profiles:
@@ -73,6 +128,8 @@ class SoftwareStreams:
 
     def _send(self) -> None:
         for number, images in enumerate(self._images, 1):
+            if self._imu is not None:
+                self._imu.send(until=number / 30)
             if number in self._missing:
                 continue
             for (sensor, profile, size), pixels in zip(self._profiles, reversed(images), strict=True):
@@ -234,6 +291,63 @@ def test_a_lens_that_cannot_be_rectified_is_refused_with_its_model_and_a_fix(
     with pytest.raises(DeviceError, match=problem) as caught:
         seen(opened(lambda: SoftwareStreams(scene(4), lens=lens, model=model)), 1)
     assert caught.value.file == "realsense://"
+
+
+def rows_of(frames: list[Frame], name: str) -> Array:
+    return np.concatenate([getattr(frame.imu, name) for frame in frames])
+
+
+@pytest.mark.parametrize("domain", ["hardware_clock", "system_time"])
+def test_samples_have_the_clock_and_axes_of_colour_and_each_sensor_its_own_rate(domain: str) -> None:
+    clock = getattr(rs.timestamp_domain, domain)
+    imu = Imu(domain=clock)
+    frames = seen(opened(lambda: SoftwareStreams(scene(20), domain=clock, imu=imu)), 8)
+    assert imu.R is not None
+    for name, period, z in (("gyroscope", 1 / 200, 0.5), ("accelerometer", 1 / 100, 2.0)):
+        rows = rows_of(frames, name)
+        assert len(rows) > 4 / 30 / period
+        np.testing.assert_allclose(np.diff(rows[:, 0]), period, atol=2e-6)  # no sample is lost or repeated
+        vectors = rows[:, 1:] @ imu.R  # in the axes of the sensor
+        np.testing.assert_allclose(vectors[:, 1:], np.tile([-1.0, z], (len(rows), 1)), atol=1e-6)
+        shift = rows[0, 0] - vectors[0, 0]  # from the clock of the device to that of the frames
+        number = 30 * (frames[0].stamp - shift)
+        assert number == pytest.approx(round(number), abs=1e-3)  # images are sent at multiples of 1/30 s
+        assert (abs(shift) < 1e-6) == (domain == "system_time")
+    for earlier, later in pairwise(frames):
+        assert later.imu is not None
+        assert (later.imu.gyro_stamps <= later.stamp).all()
+        assert (later.imu.gyro_stamps > earlier.stamp).sum() >= 5
+
+
+def test_a_device_with_a_gyroscope_alone_delivers_rates_alone() -> None:
+    frames = seen(opened(lambda: SoftwareStreams(scene(20), imu=Imu(rates=(400, 0)))), 5)
+    assert len(rows_of(frames, "gyroscope")) > 10
+    assert not len(rows_of(frames, "accelerometer"))
+
+
+@pytest.mark.parametrize(
+    ("imu", "problem"),
+    [
+        (Imu(R=None), "Requested extrinsics are not available"),
+        (Imu(R=np.zeros((3, 3))), "the matrix of its axes is no rotation"),
+        (Imu(rates=(0, 100)), "it has no gyroscope"),
+    ],
+)
+def test_an_imu_that_cannot_be_used_is_left_out_with_its_reason(
+    imu: Imu, problem: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    (frame,) = seen(opened(lambda: SoftwareStreams(scene(4), imu=imu)), 1)
+    assert frame.imu is None
+    assert f"the IMU of realsense:// is not used: {problem}" in caplog.text
+
+
+def test_samples_of_another_clock_than_the_images_are_left_out_with_a_warning(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    imu = Imu(domain=rs.timestamp_domain.hardware_clock)
+    frames = seen(opened(lambda: SoftwareStreams(scene(9), domain=rs.timestamp_domain.global_time, imu=imu)), 4)
+    assert not len(rows_of(frames, "gyroscope"))
+    assert caplog.text.count("stamps are of the device clock") == 1
 
 
 def test_lost_images_are_counted_and_a_silent_device_is_gone(monkeypatch: pytest.MonkeyPatch) -> None:
