@@ -46,7 +46,7 @@ class ImuBuffer:
         self._waiting = ImuSamples.of()
 
     def __len__(self) -> int:
-        """Return the number of samples that were not yet asked for."""
+        """Return the number of samples that no frame has taken yet."""
         return len(self._gyro) + len(self._accel)
 
     def add_rate(self, stamp: float, x: float, y: float, z: float) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,18 +13,19 @@ from splatbot.frame import Frame
 from splatbot.layouts import ORBBEC as PREFIX
 from splatbot.robots.cameras.device import CONSTANTS as DEVICE
 from splatbot.robots.cameras.device import ImageLens, RgbdDevice
+from splatbot.robots.cameras.orbbec_imu import MICROSECOND, OrbbecImu, open_imu, stamp_of
 from splatbot.robots.cameras.stream_options import StreamOptions, parse_address
 
 DEFAULT = StreamOptions(width=640, height=480)
 
 _MILLIMETRE = 0.001  # [m] unit of the depth scale of the library
-_MICROSECOND = 1e-6  # [s] unit of its stamps
 
 
 class OrbbecCamera(RgbdDevice):
     """An Orbbec camera as a source of frames; each iteration opens the device.
 
-    Stamps are Unix time. If the device has no global clock, its own is shifted to Unix time by the first image.
+    Stamps are Unix time. If the device has no global clock, its own is shifted to Unix time by the first image. Frames
+    have the samples of the IMU, if there is one.
 
     Args:
         serial: serial number; empty takes the first device.
@@ -50,7 +52,7 @@ class OrbbecCamera(RgbdDevice):
         if self._closed.is_set():
             return
         try:
-            pipeline, has_clock = self._start(ob)
+            pipeline, imu, has_clock = self._start(ob)
         except (ob.OBError, RuntimeError) as error:
             hint = (
                 "plug it into a USB 3 port, and check its sizes and rates with OrbbecViewer. Linux needs its udev rules"
@@ -71,18 +73,21 @@ class OrbbecCamera(RgbdDevice):
             shift: int | None = 0 if has_clock else None  # [us] from the clock of the stamps to Unix time
             for pair in self._pairs(wait, lambda pair: int(pair.get_color_frame().get_index())):
                 color, depth = pair.get_color_frame(), pair.get_depth_frame()
-                at, depth_at = (_stamp(image, has_clock) for image in (color, depth))
+                at, depth_at = (stamp_of(image, has_clock=has_clock) for image in (color, depth))
                 if shift is None:
                     shift = color.get_system_timestamp_us() - at
                 rgb, metres = self._images(ob, color, depth)
                 lenses = self._lens(ob, color, color, "colour"), self._lens(ob, color, depth, "depth")
-                delay = _MICROSECOND * (depth_at - at)
-                yield self._next_frame(_MICROSECOND * (at + shift), rgb, metres, lenses, delay)
+                stamp, delay = MICROSECOND * (at + shift), MICROSECOND * (depth_at - at)
+                frame = self._next_frame(stamp, rgb, metres, lenses, delay)
+                yield frame if imu is None else replace(frame, imu=imu.until(stamp, MICROSECOND * shift))
         finally:
+            if imu is not None:
+                imu.stop()
             pipeline.stop()
 
-    def _start(self, ob: Any) -> tuple[Any, bool]:
-        """Start both streams, and return the pipeline and whether the stamps have a global clock."""
+    def _start(self, ob: Any) -> tuple[Any, OrbbecImu | None, bool]:
+        """Start all streams, and return pipeline, IMU if there is one, and whether stamps have a global clock."""
         ob.Context.set_logger_to_file(ob.OBLogLevel.NONE, "")  # otherwise it writes a folder "Log" where it is started
         devices = ob.Context().query_devices()
         if not devices.get_count():
@@ -99,7 +104,8 @@ class OrbbecCamera(RgbdDevice):
         config.set_frame_aggregate_output_mode(ob.OBFrameAggregateOutputMode.FULL_FRAME_REQUIRE)
         pipeline = ob.Pipeline(device)
         pipeline.start(config)
-        return pipeline, has_clock
+        profile = pipeline.get_stream_profile_list(ob.OBSensorType.COLOR_SENSOR).get_default_video_stream_profile()
+        return pipeline, open_imu(ob, device, profile, self.uri, has_clock=has_clock), has_clock
 
     def _images(self, ob: Any, color: Any, depth: Any) -> tuple[Any, Any]:
         """Return colour (H, W, 3) and depth (H, W) [m], copied from the buffers of the library.
@@ -138,11 +144,6 @@ class OrbbecCamera(RgbdDevice):
         fisheye = d.model == models.KANNALA_BRANDT4
         size = (i.width, i.height)
         return ImageLens(self._camera(i.fx, i.fy, i.cx, i.cy, size=size, distortion=lens, fisheye=fisheye))
-
-
-def _stamp(image: Any, has_clock: bool) -> int:
-    """Return the stamp [us] of an image in the global clock, or in that of the device."""
-    return int(image.get_global_timestamp_us() if has_clock else image.get_timestamp_us())
 
 
 def _pyorbbecsdk() -> Any:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import sys
+import threading
 import time
+from collections.abc import Callable
 from enum import IntEnum
 from itertools import islice
 from types import SimpleNamespace
@@ -17,6 +19,7 @@ from numpy.typing import NDArray
 from splatbot.camera import Camera
 from splatbot.errors import DeviceError, InputError
 from splatbot.frame import Frame
+from splatbot.geometry import so3_exp
 from splatbot.protocols import Array
 from splatbot.robots.cameras import OrbbecCamera, device, open_camera
 from splatbot.robots.cameras.stream_options import StreamOptions
@@ -87,6 +90,61 @@ class FrameSet:
         self.get_color_frame, self.get_depth_frame = lambda: color, lambda: depth
 
 
+class Sample:
+    """A sample of a sensor; it holds its own time [s] since image 0 in its first component."""
+
+    def __init__(self, unix_us: int, at_us: int, z: float) -> None:
+        self.get_x, self.get_y, self.get_z = lambda: 1e-6 * at_us, lambda: -1.0, lambda: z
+        self.get_timestamp_us = lambda: DEVICE_EPOCH + at_us
+        self.get_global_timestamp_us = lambda: unix_us + at_us
+
+
+class ImuPipeline:
+    """A pipeline of the library that sends samples of 200 Hz, or of its default rate, from a thread of its own.
+
+    Args:
+        R: (3, 3) axes of the sensors in those of colour.
+        rates: [Hz] that the device has.
+    """
+
+    def __init__(self, R: Array, rates: tuple[int, ...] = (200, 100)) -> None:
+        self._R, self._rates, self._rate, self._sent, self.stopped = R, rates, 0, 0, False
+
+    def get_stream_profile_list(self, kind: str) -> Any:
+        assert kind in ("gyroscope", "accelerometer")
+        profile = SimpleNamespace(get_extrinsic_to=self._extrinsic)
+        return SimpleNamespace(get_stream_profile_by_index=lambda _: profile)
+
+    def _extrinsic(self, color: str) -> Any:
+        assert color == "colour profile"
+        return SimpleNamespace(rot=self._R.astype(np.float32), transform=np.ones(3, np.float32))
+
+    def start(self, config: Any, callback: Callable[[Any], None]) -> None:
+        if config.rates["gyro"] not in self._rates:
+            raise OBError("no matched gyro stream profile")
+        assert config.mode == "each frame alone"
+        self._rate, self._callback = config.rates["gyro"], callback
+
+    def send_until(self, image: Image) -> None:
+        """Send the samples up to 10 ms after an image from another thread, as the library does."""
+        until = image.get_timestamp_us() - DEVICE_EPOCH + 10_000
+
+        def send() -> None:
+            while self._rate and (at := self._sent * 1_000_000 // self._rate) <= until:
+                unix = image.get_global_timestamp_us() - (image.get_timestamp_us() - DEVICE_EPOCH)
+                gyro, accel = Sample(unix, at, 0.5), Sample(unix, at + 1_000, 2.0)
+                self._callback(SimpleNamespace(get_gyro_frame=lambda s=gyro: s, get_accel_frame=lambda: None))
+                self._callback(SimpleNamespace(get_gyro_frame=lambda: None, get_accel_frame=lambda s=accel: s))
+                self._sent += 1
+
+        thread = threading.Thread(target=send)
+        thread.start()
+        thread.join()
+
+    def stop(self) -> None:
+        self.stopped = True
+
+
 class Contexts:
     """The class Context of the library, which finds one list of devices."""
 
@@ -107,10 +165,20 @@ class Library:
     OBLogLevel = SimpleNamespace(NONE="none")
     OBStreamType = SimpleNamespace(COLOR_STREAM="colour stream", DEPTH_STREAM="depth stream")
     OBFormat = SimpleNamespace(RGB="RGB", Y16="Y16")
-    OBFrameAggregateOutputMode = SimpleNamespace(FULL_FRAME_REQUIRE="full")
+    OBFrameAggregateOutputMode = SimpleNamespace(FULL_FRAME_REQUIRE="full", DISABLE="each frame alone")
+    OBSensorType = SimpleNamespace(COLOR_SENSOR="colour", GYRO_SENSOR="gyroscope", ACCEL_SENSOR="accelerometer")
+    OBGyroSampleRate = SimpleNamespace(SAMPLE_RATE_200_HZ=200, SAMPLE_RATE_UNKNOWN=100)
     OBCameraDistortionModel = LensModel
 
-    def __init__(self, sets: list[FrameSet | None], *, clock: bool = True, serials: tuple[str, ...] = ("A1",)) -> None:
+    def __init__(
+        self,
+        sets: list[FrameSet | None],
+        *,
+        clock: bool = True,
+        serials: tuple[str, ...] = ("A1",),
+        imu: ImuPipeline | None = None,
+    ) -> None:
+        self._imu, self._pipelines = imu, iter([self, imu])
         self._sets, self._clock, self._serials = iter(sets), clock, serials
         self.Context = Contexts(self)
         self.lost = False
@@ -128,18 +196,30 @@ class Library:
         if serial not in self._serials:
             raise OBError(f"device {serial} not found")
         self.opened = serial
+        kinds = ["colour", "depth", "gyroscope", "accelerometer"][: 2 if self._imu is None else 4]
+        sensors = SimpleNamespace(get_count=lambda: len(kinds), get_type_by_index=kinds.__getitem__)
         return SimpleNamespace(
-            is_global_timestamp_supported=lambda: self._clock, enable_global_timestamp=lambda _enable: None
+            is_global_timestamp_supported=lambda: self._clock,
+            enable_global_timestamp=lambda _enable: None,
+            get_sensor_list=lambda: sensors,
         )
 
     def Config(self) -> Any:
-        return SimpleNamespace(
-            enable_video_stream=lambda *given: self.streams.append(given),
-            set_frame_aggregate_output_mode=lambda _: None,
-        )
+        made = SimpleNamespace(rates={})
+        made.enable_video_stream = lambda *given: self.streams.append(given)
+        made.enable_gyro_stream = lambda sample_rate: made.rates.update(gyro=sample_rate)
+        made.enable_accel_stream = lambda sample_rate: made.rates.update(accel=sample_rate)
+        made.set_frame_aggregate_output_mode = lambda mode: setattr(made, "mode", mode)
+        return made
 
-    def Pipeline(self, device: Any) -> Library:
-        return self
+    def Pipeline(self, device: Any) -> Library | ImuPipeline:
+        made = next(self._pipelines)
+        assert made is not None
+        return made
+
+    def get_stream_profile_list(self, kind: str) -> Any:
+        assert kind == "colour"
+        return SimpleNamespace(get_default_video_stream_profile=lambda: "colour profile")
 
     def start(self, config: Any) -> None:
         pass
@@ -153,6 +233,8 @@ class Library:
         found = next(self._sets, None)
         if found is None:
             time.sleep(0.01)
+        elif self._imu is not None and (image := found.get_color_frame()) is not None:
+            self._imu.send_until(image)
         return found
 
     def AlignFilter(self, align_to_stream: str) -> Any:
@@ -271,6 +353,48 @@ def test_a_lens_that_cannot_be_rectified_is_refused_with_its_model_and_a_fix(
     use(monkeypatch, Library([lens_pair(lens, depth_lens)]))
     with pytest.raises(DeviceError, match=f"{problem}.*ROS driver"):
         seen("orbbec://", 1)
+
+
+def rows_of(frames: list[Frame], name: str) -> Array:
+    return np.concatenate([getattr(frame.imu, name) for frame in frames])
+
+
+@pytest.mark.parametrize("clock", [True, False], ids=["global clock", "device clock"])
+@pytest.mark.parametrize("rates", [(200, 100), (100,)])
+def test_samples_have_the_clock_and_axes_of_colour(
+    monkeypatch: pytest.MonkeyPatch, clock: bool, rates: tuple[int, ...]
+) -> None:
+    R = so3_exp([0.4, -1.1, 0.6])
+    imu = ImuPipeline(R, rates)
+    use(monkeypatch, Library([images(k) for k in range(6)], clock=clock, imu=imu))
+    frames = seen("orbbec://", 6)
+    for name, z, first in (("gyroscope", 0.5, 0.0), ("accelerometer", 2.0, 0.001)):
+        rows = rows_of(frames, name)
+        assert len(rows) == 1 + (5 * 0.033333 - first) // (1 / rates[0])
+        vectors = rows[:, 1:] @ R  # in the axes of the sensor
+        np.testing.assert_allclose(vectors[:, 0], rows[:, 0] - frames[0].stamp, atol=1e-5)
+        np.testing.assert_allclose(vectors[:, 1:], np.tile([-1.0, z], (len(rows), 1)), atol=1e-6)
+        np.testing.assert_allclose(np.diff(rows[:, 0]), 1 / rates[0], atol=1e-5)
+    for frame in frames:
+        assert frame.imu is not None
+        assert (frame.imu.gyro_stamps <= frame.stamp).all()
+    assert imu.stopped
+
+
+@pytest.mark.parametrize(
+    ("imu", "problem"),
+    [
+        (ImuPipeline(np.zeros((3, 3))), "the matrix of its axes is no rotation"),
+        (ImuPipeline(np.eye(3), rates=()), "no matched gyro stream profile"),
+    ],
+)
+def test_an_imu_that_cannot_be_used_is_left_out_with_its_reason(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, imu: ImuPipeline, problem: str
+) -> None:
+    use(monkeypatch, Library([images(0)], imu=imu))
+    (frame,) = seen("orbbec://", 1)
+    assert frame.imu is None
+    assert f"the IMU of orbbec:// is not used: {problem}" in caplog.text
 
 
 def test_lost_images_are_counted_and_a_silent_device_is_gone(monkeypatch: pytest.MonkeyPatch) -> None:
