@@ -22,7 +22,7 @@ class Interrupts:
 
     def __init__(self) -> None:
         self.requested: int | None = None
-        self.when_requested: Callable[[], None] | None = None  # as the end of a camera that delivers no frame
+        self._when_requested: Callable[[], None] | None = None
         self._arrived: list[int] = []
         self._settled = 0  # of them, which are no longer pending
         self._raises_after: int | None = None
@@ -36,6 +36,17 @@ class Interrupts:
     def __exit__(self, *_: object) -> None:
         for number, handler in self._previous.items():
             signal.signal(number, handler)
+
+    @property
+    def when_requested(self) -> Callable[[], None] | None:
+        """Called with each signal, and when it is set after one; for example the end of a camera without frames."""
+        return self._when_requested
+
+    @when_requested.setter
+    def when_requested(self, call: Callable[[], None]) -> None:
+        self._when_requested = call
+        if self.requested is not None:
+            call()
 
     @contextmanager
     def interruptible(self, *, after: int = 0) -> Iterator[None]:
@@ -68,8 +79,8 @@ class Interrupts:
     def _handle(self, number: int, _frame: FrameType | None) -> None:
         self._arrived.append(number)
         self.requested = self.requested or number
-        if self.when_requested is not None:
-            self.when_requested()
+        if self._when_requested is not None:
+            self._when_requested()
         self._raise_if_requested()
 
     def _raise_if_requested(self) -> None:

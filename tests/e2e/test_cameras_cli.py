@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
 
-from splatbot.cli import main
+from splatbot.cli import main, record
 from splatbot.logs import open_log
 from tests.terminal import at_a_terminal
 from tests.waiting import until
@@ -76,6 +79,22 @@ def test_one_signal_ends_a_silent_camera(tmp_path: Path, number: signal.Signals)
     process.send_signal(number)
     assert process.wait(30) == 0
     assert len(open_log(tmp_path / "a.mcap")) == 5
+
+
+def test_ctrl_c_before_the_display_of_a_recording_is_there_ends_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    show = record.steps
+
+    @contextmanager
+    def signalled(quiet: bool) -> Iterator[Callable[[str], None]]:
+        os.kill(os.getpid(), signal.SIGINT)
+        with show(quiet) as step:
+            yield step
+
+    monkeypatch.setattr(record, "steps", signalled)
+    assert main(["record", CAMERA, "--out", str(tmp_path / "a.mcap")]) == 0
+    assert 1 <= len(open_log(tmp_path / "a.mcap")) < 400
 
 
 @pytest.mark.long

@@ -29,6 +29,19 @@ def test_no_signal_raises_where_nothing_may_be_cut_short() -> None:
         assert interrupts.requested == signal.SIGINT
 
 
+def test_a_signal_before_and_after_its_callback_is_set_calls_it() -> None:
+    calls: list[str] = []
+    with Interrupts() as interrupts:
+        send()
+        interrupts.when_requested = lambda: calls.append("called")
+        assert calls == ["called"]
+        send()
+        assert calls == ["called"] * 2
+    with Interrupts() as interrupts:
+        interrupts.when_requested = lambda: calls.append("called")
+    assert calls == ["called"] * 2
+
+
 @pytest.mark.parametrize("before", [0, 1])
 def test_an_interruptible_block_ends_at_the_first_signal_beyond_those_allowed(before: int) -> None:
     reached = []
