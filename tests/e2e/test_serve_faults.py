@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import signal
 import threading
-import time
 from pathlib import Path
 
 import httpx
@@ -12,16 +11,17 @@ import pytest
 
 from splatbot.gaussians import GaussianModel
 from tests.e2e.test_serve_cli import serving
+from tests.waiting import until
 
 LOG = "synthetic:tabletop?frames=300&width=160&height=120"
 
 
 def _until_mapped(client: httpx.Client, versions: int) -> int:
-    deadline = time.monotonic() + 120
-    while (version := int(client.get("/v1/maps/desk").json()["map_version"])) < versions:
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
-    return version
+    def version() -> int:
+        return int(client.get("/v1/maps/desk").json()["map_version"])
+
+    until(lambda: version() >= versions, 120)
+    return version()
 
 
 def _asking(url: str, stop: threading.Event, seen: list[int]) -> None:
@@ -45,7 +45,8 @@ def test_a_restart_serves_the_last_saved_map_whatever_ended_the_service(
         before = _until_mapped(client, 3)
         asker = threading.Thread(target=_asking, args=(str(client.base_url), stop, seen))
         asker.start()
-        time.sleep(1.0)  # of questions and savings
+        until((tmp_path / "maps" / "desk" / "current").is_file)
+        until(lambda: len(seen) > 2)  # questions and savings
         process.send_signal(number)
         code = process.wait(30)
         stop.set()
