@@ -114,16 +114,24 @@ class JointStates:
     def at(self, stamp: float) -> tuple[tuple[str, ...], NDArray[np.float64]] | None:
         """Interpolate all joints that are known at a stamp [s]: names, and positions (J,) [rad or m]; see JointRecord.
 
-        Joints without names are only those of the first publisher without names, and only if no joint has a name.
+        Of several publishers of a joint, the one with the message nearest in time counts. Joints without names are only
+        those of the first publisher without names, and only if no joint has a name.
         """
-        found = [(names, interpolate_joints(stamps, joints, stamp)) for names, stamps, joints in self._publishers]
-        named: dict[str, float] = {}
-        for names, positions in found:
-            if positions is not None:
-                named |= {name: float(q) for name, q in zip(names, positions, strict=False) if name not in named}
+        named: dict[str, tuple[float, float]] = {}  # time [s] to the nearest message, and position
+        unnamed: NDArray[np.float64] | None = None
+        for names, stamps, joints in self._publishers:
+            positions = interpolate_joints(stamps, joints, stamp)
+            if positions is None:
+                continue
+            if not names:
+                unnamed = positions if unnamed is None else unnamed
+            gap = float(np.abs(stamps - stamp).min())
+            for name, q in zip(names, positions.tolist(), strict=False):
+                if name not in named or gap < named[name][0]:
+                    named[name] = gap, q
         if named:
-            return tuple(named), np.array(list(named.values()))
-        return next((((), positions) for names, positions in found if not names and positions is not None), None)
+            return tuple(named), np.array([q for _, q in named.values()])
+        return None if unnamed is None else ((), unnamed)
 
     def of(self, names: Sequence[str], stamp: float) -> NDArray[np.float64] | None:
         """Interpolate the joints with given names at a stamp [s]: positions (J,), NaN where one is not known.

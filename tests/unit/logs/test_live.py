@@ -66,6 +66,38 @@ def test_frames_of_any_delay_between_colour_and_depth_keep_their_numbers(make_lo
                 np.testing.assert_array_equal(frame.depth, source[k].depth)
 
 
+def test_a_recording_has_the_joints_of_both_times_of_the_live_frames_also_of_a_fast_motion(
+    make_log: MakeLog, tmp_path: Path
+) -> None:
+    def at(stamp: float) -> np.ndarray:
+        return np.array([np.sin(90 * stamp), np.cos(70 * stamp)])
+
+    delays = [0.03, -0.02, 0.06, 0.0, 0.013]  # one depth image is later than the next image of colour
+    frames = [
+        replace(
+            frame,
+            depth_delay=delay,
+            joints=at(frame.stamp),
+            joint_names=("a", "b"),
+            depth_joints=at(frame.stamp + delay) if delay else None,
+        )
+        for frame, delay in zip(open_log(make_log(5, period=0.05)), delays, strict=True)
+    ]
+    known_a = np.array([1.0, np.nan])  # b is not known at the time of depth
+    frames[4] = replace(frames[4], depth_joints=at(frames[4].stamp + delays[4]) * known_a)
+    recorded = RecordedCamera(GivenFrames(frames), tmp_path / "a.mcap")
+    recorded.close()
+    for frame, read in zip(frames, open_log(tmp_path / "a.mcap"), strict=True):
+        assert read.joint_names == ("a", "b")
+        np.testing.assert_array_equal(read.joints, frame.joints)
+        if frame.depth_joints is None:
+            assert read.depth_joints is None
+            continue
+        assert read.depth_joints is not None
+        known = np.isfinite(frame.depth_joints)
+        np.testing.assert_allclose(read.depth_joints[known], frame.depth_joints[known], atol=1e-12)
+
+
 def test_frames_have_the_numbers_and_stamps_of_the_recording(make_log: MakeLog, tmp_path: Path) -> None:
     source = list(open_log(make_log(6)))
     unix = [1.7e9 + k / 3 + 1e-7 for k in range(6)]
