@@ -77,19 +77,21 @@ def running(
     server = Server(runtime, app, [("127.0.0.1", 0)])
     thread = threading.Thread(target=server.run, args=(list(server.listeners),), daemon=True)
     thread.start()
-    while not server.started:
-        assert thread.is_alive(), "the server did not start"
-        time.sleep(0.01)
-    scheme = "http" if settings.tls_cert is None else "https"
-    url = f"{scheme}://127.0.0.1:{server.listeners[0].getsockname()[1]}"
-    trusted = True if settings.tls_cert is None else ssl.create_default_context(cafile=str(settings.tls_cert))
-    key = None if settings.api_keys else read_key(key_file())
-    headers = {"Authorization": f"Bearer {key}"} if key else {}
-    with httpx.Client(base_url=url, timeout=60, verify=trusted, headers=headers) as client:
-        yield Service(client, runtime, app, url, key)
-    runtime.drain()
-    server.should_exit = True
-    thread.join(20)
+    try:
+        while not server.started:
+            assert thread.is_alive(), "the server did not start"
+            time.sleep(0.01)
+        scheme = "http" if settings.tls_cert is None else "https"
+        url = f"{scheme}://127.0.0.1:{server.listeners[0].getsockname()[1]}"
+        trusted = True if settings.tls_cert is None else ssl.create_default_context(cafile=str(settings.tls_cert))
+        key = None if settings.api_keys else read_key(key_file())
+        headers = {"Authorization": f"Bearer {key}"} if key else {}
+        with httpx.Client(base_url=url, timeout=60, verify=trusted, headers=headers) as client:
+            yield Service(client, runtime, app, url, key)
+    finally:  # a failed test, too, leaves no server that the next ones share the machine with
+        runtime.drain()
+        server.should_exit = True
+        thread.join(60)
     assert not thread.is_alive(), "the server did not end"
 
 
@@ -148,9 +150,9 @@ def _sheet(
     return means, scales
 
 
-@pytest.fixture
-def service() -> Iterator[Service]:
-    """The service on the map "wall", with small limits."""
+@contextmanager
+def serving_wall() -> Iterator[Service]:
+    """Run the service on the map "wall", with small limits."""
     store = MapStore()
     beside = Workspace(T_world_base=pose_from_quat((0.0, 0.5, -1.0), (0.7071068, 0.7071068, 0.0, 0.0)))
     store.add("wall", source="wall.ply", state="static", snapshot=wall(), workspace=beside)
@@ -158,4 +160,11 @@ def service() -> Iterator[Service]:
         max_points=1000, max_body_bytes=200_000, max_pixels=640 * 480, max_message_bytes=2_000_000
     )
     with running(settings, store) as it:
+        yield it
+
+
+@pytest.fixture
+def service() -> Iterator[Service]:
+    """The service on the map "wall", with small limits."""
+    with serving_wall() as it:
         yield it

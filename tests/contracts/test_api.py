@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -21,11 +20,13 @@ from splatbot.geometry import pose_from_quat
 from splatbot.logs import open_log
 from splatbot.rasterize.views import render_view
 from splatbot.robots.panda import panda
+from splatbot.services.jobs import ENDED
 from splatbot.services.settings import ServiceSettings
 from splatbot.services.store import MapStore
 from splatbot.trajectory import Trajectory
 from splatbot.workspace import Workspace
 from tests.contracts.conftest import Service, running, table_with_box, wall
+from tests.waiting import until
 
 LOG = "synthetic:tabletop?frames=6&width=160&height=120&arc=4"
 BASE = {"translation": [0.0, 0.5, 0.0], "quaternion_wxyz": [0.7071068, 0.7071068, 0.0, 0.0]}
@@ -77,6 +78,7 @@ def test_every_documented_example_is_answered_as_documented(api: Service) -> Non
             asked += 1
     for job in api.runtime.jobs.list():
         api.runtime.jobs.cancel(job.id)  # the tests that follow need not wait for these requests
+    until(lambda: all(job.state in ENDED for job in api.runtime.jobs.list()))  # nor see their maps change
     assert asked >= 23
 
 
@@ -242,10 +244,7 @@ def test_pushed_frames_are_mapped_as_the_log_they_come_from(api: Service, robot:
         assert p.T_world_camera is not None
         np.testing.assert_allclose(p.T_world_camera[:3, 3], (first @ T)[:3, 3], atol=0.02)
     robot.end("pushed")
-    deadline = time.monotonic() + 60
-    while robot.map("pushed")["state"] == "mapping":
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
+    until(lambda: robot.map("pushed")["state"] != "mapping")
     with pytest.raises(ServiceError, match="no more frames"):
         robot.push("pushed", log.read(0))
 
@@ -268,8 +267,7 @@ def test_a_frame_for_a_map_that_takes_none_or_of_nonsense_is_refused(api: Servic
 
 def test_a_job_is_cancelled_and_what_was_mapped_is_kept(api: Service, robot: Client) -> None:
     job = robot.create_map("long", "synthetic:tabletop?frames=500&width=160&height=120")
-    while not robot.map("long")["map_version"]:
-        time.sleep(0.02)
+    until(lambda: robot.map("long")["map_version"])
     assert api.client.delete(f"/v1/jobs/{job['id']}").status_code == 200
     assert robot.wait(job["id"], timeout_s=60)["state"] == "cancelled"
     assert robot.map("long")["gaussians"] > 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import cv2
@@ -11,10 +12,24 @@ import pytest
 from numpy.typing import NDArray
 
 from splatbot.services.store import MapStore
-from tests.contracts.conftest import Service, wall
+from tests.contracts.conftest import Service, serving_wall, wall
 
 POINTS = [[0.0, 0.0, 1.0], [0.0, 0.0, 0.5], [0.1, 0.2, 1.0005]]
 CAMERA = {"fx": 200, "fy": 200, "cx": 79.5, "cy": 59.5, "width": 160, "height": 120}
+
+
+@pytest.fixture(scope="module")
+def service() -> Iterator[Service]:
+    """The service on the map "wall", which its tests do not change."""
+    with serving_wall() as it:
+        yield it
+
+
+@pytest.fixture
+def own_service() -> Iterator[Service]:
+    """The service of one test, which may change its maps."""
+    with serving_wall() as it:
+        yield it
 
 
 def _problem(response: httpx.Response, status: int) -> dict[str, Any]:
@@ -65,23 +80,23 @@ def test_no_points_are_a_question_with_an_empty_answer(service: Service) -> None
     assert (answer.status_code, answer.json()["distance_sigma"]) == (200, [])
 
 
-def test_an_empty_map_answers_null_because_json_has_no_infinity(service: Service) -> None:
+def test_an_empty_map_answers_null_because_json_has_no_infinity(own_service: Service) -> None:
     empty = wall()
     model = empty.model.select((empty.model.means[:, 0] > 9).nonzero()[:, 0])
-    service.store.add("void", source="nothing", state="static", snapshot=type(empty)(model, 1))
-    answer = service.client.post("/v1/maps/void/distance", json={"points": [[0, 0, 0]]}).json()
+    own_service.store.add("void", source="nothing", state="static", snapshot=type(empty)(model, 1))
+    answer = own_service.client.post("/v1/maps/void/distance", json={"points": [[0, 0, 0]]}).json()
     assert (answer["distance_sigma"], answer["index"], answer["inside"]) == ([None], [-1], [False])
 
 
-def test_the_version_grows_with_the_map_and_answers_follow(service: Service) -> None:
+def test_the_version_grows_with_the_map_and_answers_follow(own_service: Service) -> None:
     ask = {"points": [[0.0, 0.0, 2.0]]}
-    before = service.client.post("/v1/maps/wall/distance", json=ask).json()
-    service.store.publish("wall", wall(2, z=2.0))
-    after = service.client.post("/v1/maps/wall/distance", json=ask).json()
+    before = own_service.client.post("/v1/maps/wall/distance", json=ask).json()
+    own_service.store.publish("wall", wall(2, z=2.0))
+    after = own_service.client.post("/v1/maps/wall/distance", json=ask).json()
     assert (before["map_version"], before["inside"]) == (1, [False])
     assert (after["map_version"], after["inside"]) == (2, [True])
-    assert service.client.get("/v1/maps/wall").json()["map_version"] == 2
-    assert service.client.get("/v1/maps/wall/render").headers["x-map-version"] == "2"
+    assert own_service.client.get("/v1/maps/wall").json()["map_version"] == 2
+    assert own_service.client.get("/v1/maps/wall/render").headers["x-map-version"] == "2"
 
 
 @pytest.mark.parametrize(
@@ -169,14 +184,14 @@ def test_a_pose_as_quaternion_draws_what_the_same_pose_as_matrix_draws(service: 
     assert int((np.abs(images[0].astype(int) - images[1].astype(int)) > 1).sum()) == 0
 
 
-def test_a_picture_is_sent_again_only_after_the_map_has_changed(service: Service) -> None:
-    first = service.client.get("/v1/maps/wall/render")
+def test_a_picture_is_sent_again_only_after_the_map_has_changed(own_service: Service) -> None:
+    first = own_service.client.get("/v1/maps/wall/render")
     tag = {"If-None-Match": first.headers["etag"]}
-    same = service.client.get("/v1/maps/wall/render", headers=tag)
+    same = own_service.client.get("/v1/maps/wall/render", headers=tag)
     assert (same.status_code, same.content, same.headers["etag"]) == (304, b"", first.headers["etag"])
-    assert service.client.get("/v1/maps/wall/render", params={"mode": "depth"}, headers=tag).status_code == 200
-    service.store.publish("wall", wall(2))
-    assert service.client.get("/v1/maps/wall/render", headers=tag).status_code == 200
+    assert own_service.client.get("/v1/maps/wall/render", params={"mode": "depth"}, headers=tag).status_code == 200
+    own_service.store.publish("wall", wall(2))
+    assert own_service.client.get("/v1/maps/wall/render", headers=tag).status_code == 200
 
 
 @pytest.mark.parametrize(
@@ -209,8 +224,8 @@ def test_the_api_describes_itself(service: Service) -> None:
     assert "/v1/maps/{map_id}/distance" in service.client.get("/openapi.json").json()["paths"]
 
 
-def test_the_store_is_shared_not_copied(service: Service) -> None:
-    assert isinstance(service.store, MapStore)
-    service.store.set_state("wall", "failed", "the log broke at frame 7")
-    described = service.client.get("/v1/maps/wall").json()
+def test_the_store_is_shared_not_copied(own_service: Service) -> None:
+    assert isinstance(own_service.store, MapStore)
+    own_service.store.set_state("wall", "failed", "the log broke at frame 7")
+    described = own_service.client.get("/v1/maps/wall").json()
     assert (described["state"], described["detail"]) == ("failed", "the log broke at frame 7")

@@ -69,9 +69,10 @@ def test_drops_noise_a_stall_and_an_unplugged_device_cost_only_their_frames(log:
     assert known[-1] < 0.02
 
 
-def test_a_device_that_stays_away_ends_the_map_which_is_still_served(log: Log) -> None:
+def test_a_device_that_stays_away_ends_the_map_which_is_still_served(log: Log, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("splatbot.robots.cameras.replay._QUEUE", 20)  # none is lost, however slow the machine is
     with running(ServiceSettings(port=0, camera_wait_s=0.6)) as service:
-        results, details = follow(service, ReplayCamera(log, ReplayOptions(unplug=20, speed=0.3)))
+        results, details = follow(service, ReplayCamera(log, ReplayOptions(unplug=20, speed=10)))
         assert details[-1] == "failed"
-        assert 10 <= len(results) <= 20
+        assert len(results) == 20
         assert service.client.get("/v1/maps/camera").json()["gaussians"] > 500

@@ -11,7 +11,7 @@ from typing import Any
 
 import roslibpy
 
-_WAIT_S = 20
+_WAIT_S = 30
 
 
 def _first(ros: Any, name: str, kind: str, **options: Any) -> Any:
@@ -61,10 +61,9 @@ def _push_frames(ros: Any, count: int) -> Any:
         topics["color/camera_info"].publish(roslibpy.Message(info))
         topics["depth/image_raw"].publish(_image(1 + i / 10, "16UC1", width, height, depth))
         topics["color/image_raw"].publish(_image(1 + i / 10, "rgb8", width, height, rgb))
-        time.sleep(0.3)
-    until = time.monotonic() + _WAIT_S
-    while len(seen) < count and time.monotonic() < until:
-        time.sleep(0.05)
+        until = time.monotonic() + _WAIT_S
+        while len(seen) <= i and time.monotonic() < until:  # mapping takes the newest frame, and drops others
+            time.sleep(0.02)
     return [message["pose"]["pose"]["position"] for message in seen]
 
 
@@ -74,8 +73,7 @@ def _serve_and_call(ros: Any) -> Any:
         return True
 
     service = roslibpy.Service(ros, "/add_two_ints", "example_interfaces/AddTwoInts")
-    service.advertise(answer)
-    time.sleep(0.3)
+    service.advertise(answer)  # the call follows on the same connection
     return _call(ros, "/add_two_ints", "example_interfaces/AddTwoInts", {"a": 3, "b": 4})
 
 
