@@ -96,10 +96,11 @@ class SoftwareStreams:
         model: str = "inverse_brown_conrady",
         baseline: float = 0.0,
         domain: Any = None,
+        unix_from: int | None = None,
         missing: tuple[int, ...] = (),
         imu: Imu | None = None,
     ) -> None:
-        self._images, self._missing, self._imu = images, missing, imu
+        self._images, self._missing, self._imu, self._unix_from = images, missing, imu, unix_from
         self._domain = domain or rs.timestamp_domain.hardware_clock
         self._device = rs.software_device()
         self._profiles = []
@@ -137,6 +138,8 @@ class SoftwareStreams:
                 frame.stride, frame.bpp, frame.pixels = WIDTH * size, size, np.ascontiguousarray(pixels)
                 frame.timestamp = 1000 * (number - 1) / 30  # the matcher of software devices needs stamps from 0
                 frame.domain, frame.frame_number = self._domain, number
+                if self._unix_from is not None and number >= self._unix_from:
+                    frame.domain = rs.timestamp_domain.global_time
                 frame.profile = profile.as_video_stream_profile()
                 if size == 2:
                     frame.depth_units = UNITS
@@ -194,6 +197,12 @@ def _first(images: list[tuple[NDArray[np.uint8], NDArray[np.uint16]]], frames: l
 def test_stamps_in_system_time_are_kept() -> None:
     (frame,) = seen(opened(lambda: SoftwareStreams(scene(4), domain=rs.timestamp_domain.system_time)), 1)
     assert 0.0 <= frame.stamp < 1.0
+
+
+def test_stamps_that_change_to_unix_time_are_not_shifted_any_more() -> None:
+    frames = seen(opened(lambda: SoftwareStreams(scene(12), unix_from=5)), 8)
+    assert abs(frames[0].stamp - time.time()) < 3.0
+    assert 0.0 < frames[-1].stamp < 1.0  # Unix time of the software device
 
 
 def test_depth_is_registered_to_colour_over_the_baseline() -> None:
