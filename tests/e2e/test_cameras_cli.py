@@ -133,7 +133,10 @@ def test_several_cameras_are_mapped_live_and_a_killed_run_is_resumed_with_their_
     assert main(["map", str(rig), "--out", str(tmp_path / "few"), "--max-frames", "1", "--quiet"]) == 2
 
 
-def test_a_camera_that_is_lost_keeps_map_and_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_camera_that_is_lost_keeps_map_and_recording(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("splatbot.robots.cameras.replay._QUEUE", 12)  # a busy machine records late, and loses none
     out = tmp_path / "run"
     assert main(["map", f"{CAMERA}&unplug=12", "--out", str(out), "--quiet", "--no-report"]) != 0
     assert "is gone" in capsys.readouterr().err

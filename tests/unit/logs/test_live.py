@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -35,7 +36,10 @@ class GivenFrames:
         pass
 
 
-def test_a_slow_reader_misses_frames_but_the_recording_has_all(make_log: MakeLog, tmp_path: Path) -> None:
+def test_a_slow_reader_misses_frames_but_the_recording_has_all(
+    make_log: MakeLog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("splatbot.robots.cameras.replay._QUEUE", 12)  # else a busy machine records late, and loses some
     source = open_log(make_log(12, period=0.05))
     recorded = RecordedCamera(ReplayCamera(source), tmp_path / "a.mcap")
     numbers = []
@@ -109,17 +113,34 @@ def test_frames_have_the_numbers_and_stamps_of_the_recording(make_log: MakeLog, 
     assert read == pytest.approx(unix, abs=2e-7)
 
 
-def test_it_ends_after_a_number_of_frames_or_seconds(make_log: MakeLog, tmp_path: Path) -> None:
+def test_it_ends_after_a_number_of_frames_or_seconds(
+    make_log: MakeLog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     log = open_log(make_log(20, period=0.05))
     three = RecordedCamera(ReplayCamera(log), tmp_path / "a.mcap", max_frames=3)
     list(three.arrivals())
     assert len(three) == len(open_log(tmp_path / "a.mcap")) == 3
-    brief = RecordedCamera(ReplayCamera(log), tmp_path / "b.mcap", seconds=0.3)
+    clock = SimpleNamespace(monotonic=lambda: now[0])
+    now = [100.0]
+
+    class Timed(GivenFrames):
+        """Each frame comes 0.05 s after the one before, on the clock of the recording."""
+
+        def __iter__(self) -> Iterator[Frame]:
+            for frame in self._frames:
+                now[0] += 0.05
+                yield frame
+
+    monkeypatch.setattr(live, "time", clock)
+    brief = RecordedCamera(Timed(list(log)), tmp_path / "b.mcap", seconds=0.33)
     list(brief.arrivals())
-    assert 4 <= len(brief) <= 12
+    assert len(brief) == 8  # the clock of the recording starts with the first
 
 
-def test_frames_up_to_the_loss_of_the_device_are_kept(make_log: MakeLog, tmp_path: Path) -> None:
+def test_frames_up_to_the_loss_of_the_device_are_kept(
+    make_log: MakeLog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("splatbot.robots.cameras.replay._QUEUE", 8)
     camera = ReplayCamera(open_log(make_log(8, period=0.02)), ReplayOptions(unplug=5))
     recorded = RecordedCamera(camera, tmp_path / "a.mcap")
     with pytest.raises(DeviceError, match="gone"):
