@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +18,20 @@ from splatbot.logs.index import associate
 from splatbot.logs.realsense_files import BagFile, Images, RealSenseFile, SqliteFile
 from splatbot.logs.registration import ColorRegistration
 from splatbot.logs.ros_frames import camera_of, color_of, depth_of
-from splatbot.logs.undistort import Undistorter
+from splatbot.logs.undistort import Undistorter, modified_source_pixels
 from splatbot.protocols import Array
 
 _PAIR_WITHIN_S = 0.04  # depth and colour of one device run at rates of their own, often 30 Hz without a common trigger
-_MODELS = ("", "None", "Brown Conrady", "Inverse Brown Conrady")
+_MODELS = {
+    "": "plumb_bob",
+    "None": "plumb_bob",
+    "Brown Conrady": "plumb_bob",
+    "Modified Brown Conrady": "plumb_bob",
+    "Inverse Brown Conrady": "plumb_bob",
+    "Kannala Brandt4": "equidistant",
+}
+"""Models of librealsense in ROS, whose coefficients are OpenCV's."""
+_MODIFIED = ("Modified Brown Conrady", "Inverse Brown Conrady")  # with other tangential terms than OpenCV's
 _ROS_UNITS = 1e-3  # [m] that the decoder of ROS images assumes
 
 _log = logging.getLogger(__name__)
@@ -52,16 +62,12 @@ class RealSenseLog(StampedLog):
         if units is not None and not 1e-6 <= units <= 1.0:
             raise self._bad("depth units", f"is {units}", "give metres per unit, as 0.001")
         self._units = _ROS_UNITS if units is None else units
-        color, depth = (self._camera_of(stream) for stream in (self._color, self._depth))
-        self._lenses = {
-            stream: Undistorter(camera)
-            for stream, camera in ((self._color, color), (self._depth, depth))
-            if camera.distortion
-        }
-        color, self.camera = color.pinhole, depth.pinhole
+        self._lenses: dict[str, Undistorter] = {}
+        color, self.camera = (self._undistorted(stream) for stream in (self._color, self._depth))
         T_color_depth = self._rigid(self._color) @ inverse(self._rigid(self._depth))
+        unseen = self._lenses[self._color].unseen if self._color in self._lenses else None
         try:
-            self._registration = ColorRegistration(color, self.camera, T_color_depth)
+            self._registration = ColorRegistration(color, self.camera, T_color_depth, unseen=unseen)
         except CameraError as error:
             raise CameraError(error.message, file=self.path, field=error.field, hint=error.hint) from error
         self._pair(self._file.images(self._color), self._file.images(self._depth))
@@ -109,15 +115,21 @@ class RealSenseLog(StampedLog):
             raise self._bad(kind.lower(), f"is not recorded (streams: {names})", "record depth and colour")
         return found[0]
 
-    def _camera_of(self, stream: str) -> Camera:
+    def _undistorted(self, stream: str) -> Camera:
+        """Return the pinhole camera of a stream, and keep its lens if it has one."""
         info = self._file.camera_info(stream)
-        if info.distortion_model in _MODELS:
-            info.distortion_model = "plumb_bob"  # OpenCV's five coefficients
+        model = info.distortion_model
+        k, d = (getattr(info, name, getattr(info, name.upper(), ())) for name in ("k", "d"))  # of ROS 2 or ROS 1
+        count = {"None": 0, "Kannala Brandt4": 4}.get(model, len(d))
+        size = {"width": info.width, "height": info.height}
         try:
-            return camera_of(info)
+            camera = camera_of(SimpleNamespace(k=k, d=d[:count], distortion_model=_MODELS.get(model, model), **size))
+            if camera.distortion:
+                self._lenses[stream] = Undistorter(camera, modified_source_pixels if model in _MODIFIED else None)
         except CameraError as error:
             field = f"{stream} {error.field}"
             raise CameraError(error.message, file=self.path, field=field, hint=error.hint) from error
+        return camera.pinhole
 
     def _rigid(self, stream: str) -> Array:
         T = self._file.extrinsics(stream)

@@ -34,7 +34,14 @@ def images(count: int = FRAMES) -> list[Pair]:
     return [(rgb, np.round((depth + 0.01 * k) / UNITS).astype(np.uint16)) for k, rgb in enumerate(colors)]
 
 
-def recorded(path: Path, frames: list[Pair], *, color: bool = True, lens: tuple[float, ...] = (0.0,) * 5) -> Path:
+def recorded(
+    path: Path,
+    frames: list[Pair],
+    *,
+    color: bool = True,
+    lens: tuple[float, ...] = (0.0,) * 5,
+    model: str = "brown_conrady",
+) -> Path:
     """Record a software device with librealsense."""
     rs = pytest.importorskip("pyrealsense2", reason="pyrealsense2 (extra realsense) is not installed")
     device = rs.software_device()
@@ -47,7 +54,9 @@ def recorded(path: Path, frames: list[Pair], *, color: bool = True, lens: tuple[
             continue
         sensor, video, inner = device.add_sensor(name), rs.video_stream(), rs.intrinsics()
         inner.width, inner.height, inner.fx, inner.fy, inner.ppx, inner.ppy = WIDTH, HEIGHT, focal, focal, 79.5, 59.5
-        inner.model, inner.coeffs = rs.distortion.brown_conrady, list(lens if size == 3 else (0.0,) * 5)
+        inner.model, inner.coeffs = rs.distortion.brown_conrady, [0.0] * 5
+        if size == 3:
+            inner.model, inner.coeffs = getattr(rs.distortion, model), list(lens)
         video.type, video.index, video.uid, video.fmt, video.bpp = stream, 0, size, kind, size
         video.width, video.height, video.fps, video.intrinsics = WIDTH, HEIGHT, 30, inner
         profiles.append((sensor, sensor.add_video_stream(video), size))
@@ -189,6 +198,46 @@ def test_a_lens_is_undistorted_before_colour_is_registered(tmp_path: Path) -> No
     )
     moved = np.abs(lens.rgb.astype(int) - plain.rgb)[..., 0]
     assert moved[:, 140:].mean() > 2 * moved[:, 70:90].mean()  # radial: growing from the middle
+
+
+BROWN = (0.3, -0.2, 0.06, -0.05, 0.05)
+
+
+@pytest.mark.parametrize(
+    ("model", "lens"),
+    [
+        ("none", BROWN),
+        ("brown_conrady", BROWN),
+        ("modified_brown_conrady", BROWN),
+        ("inverse_brown_conrady", BROWN),
+        ("kannala_brandt4", (0.05, -0.02, 0.01, -0.003, 0.0)),
+    ],
+)
+def test_each_depth_pixel_has_the_colour_where_librealsense_projects_its_point(
+    tmp_path: Path, model: str, lens: tuple[float, ...]
+) -> None:
+    rs = pytest.importorskip("pyrealsense2", reason="pyrealsense2 (extra realsense) is not installed")
+    frame = open_log(recorded(tmp_path / "a.db3", images(1), lens=lens, model=model))[0]
+    depth, color, moved = rs.intrinsics(), rs.intrinsics(), rs.extrinsics()
+    for inner, focal, kind, values in ((depth, FX, "none", [0.0] * 5), (color, FX_COLOR, model, list(lens))):
+        inner.width, inner.height, inner.fx, inner.fy, inner.ppx, inner.ppy = WIDTH, HEIGHT, focal, focal, 79.5, 59.5
+        inner.model, inner.coeffs = getattr(rs.distortion, kind), values
+    moved.rotation, moved.translation = ROTATION, MOVE
+    errors = []
+    for v in range(5, HEIGHT - 5, 6):
+        for u in [*range(5, WIDTH // 2 - 12, 6), *range(WIDTH // 2 + 12, WIDTH - 5, 6)]:
+            point = rs.rs2_deproject_pixel_to_point(depth, [u, v], 0.5 if u < WIDTH // 2 else 1.0)
+            x, y = rs.rs2_project_point_to_pixel(color, rs.rs2_transform_point_to_point(moved, point))
+            if 2 < x < WIDTH - 3 and 2 < y < HEIGHT - 3 and frame.depth[v, u] > 0:
+                errors.append(np.abs(frame.rgb[v, u, :2] - np.array([x, 2 * y])).max())
+    assert len(errors) > 150
+    assert max(errors) < 2.5
+
+
+def test_a_lens_of_another_model_is_refused_with_its_name(tmp_path: Path) -> None:
+    path = recorded(tmp_path / "a.db3", images(1), lens=(0.9, 0.0, 0.0, 0.0, 0.0), model="ftheta")
+    with pytest.raises(CameraError, match=r"Color_0 distortion_model: is 'Ftheta'"):
+        open_log(path)
 
 
 def test_it_is_mapped_and_described_as_any_log(database: Path, tmp_path: Path, capsys: Any) -> None:
