@@ -91,6 +91,7 @@ def recording_html(recording: TwinRecording, *, title: str, facts: str, target: 
         "rises": np.round(recording.rise(target), 5).tolist() if target else [],
         "riseColor": css(_RISE),
         "clearances": np.round(recording.clearances, 5).tolist(),
+        "clearanceName": _clearance_name(world),
         "far": FAR,
         "times": np.round(recording.times, 4).tolist(),
         "middle": ((low + high) / 2).round(3).tolist(),
@@ -99,6 +100,12 @@ def recording_html(recording: TwinRecording, *, title: str, facts: str, target: 
         "size": CONSTANTS.point_size,
     }
     return moving_page(title, facts, document, "twin_view.js", legend=_legend(recording, target), curve=True)
+
+
+def _clearance_name(world: World) -> str:
+    """Name the clearance that a recording has at each time: of the whole robot with its hand."""
+    has_hand = world.robot is not None and world.robot.gripper is not None
+    return "clearance of arm and hand" if has_hand else "clearance of the arm"
 
 
 def _rounded(contacts: Sequence[Sequence[Sequence[float]]]) -> list[list[list[float]]]:
@@ -123,7 +130,7 @@ def _legend(recording: TwinRecording, target: str) -> list[tuple[str, str]]:
         rows.append(("contact of the arm; in the curve its time", css(_CONTACT)))
     if any(recording.grips):
         rows.append(("contact of the hand with the target, as expected", css(_GRIP)))
-    rows.append(("clearance of the arm", "var(--curve)"))
+    rows.append((f"{_clearance_name(world)}, in the curve", "var(--curve)"))
     if target:
         rows.append(("rise of the target, in the curve", css(_RISE)))
     return rows

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from splatbot.cli.paths import check_file, check_output
+from splatbot.cli.paths import check_file, result_folder, written_to
 from splatbot.cli.placing import Pose, agree_with_plans, base_pose, margin_value, named_robot, run_folder
 from splatbot.errors import InputError, SplatbotError
 from splatbot.layouts import map_file
@@ -52,6 +52,7 @@ def grasp(
     seed: int = 0,
     verbose: bool = False,
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
+    overwrite: bool = False,
 ) -> int:
     """Find grasps of an object in a map, best first, with each term of their scores.
 
@@ -101,7 +102,8 @@ def grasp(
             keyframes observed is then no obstacle for the arm either.
         seed: seed of the search.
         verbose: print the terms of the scores; without a grasp, the counts of each reason.
-        out: folder to write to; by default runs/grasp.
+        out: folder to write to; by default runs/grasp, whose earlier results are replaced.
+        overwrite: replace the results of an earlier call in the folder that --out names.
     """
     places = {"--target": target, "--pixel": pixel, "--point": point, "--box": box, "--mask": mask, "--tag": tag}
     given = [flag for flag, value in places.items() if value not in (None, ())]
@@ -114,13 +116,13 @@ def grasp(
         check_file(path, "--mask")
     if len(index) != max(len(mask), 1):
         raise InputError(f"are {len(index)} for {max(len(mask), 1)}.", field="--index", hint="give one for each mask")
-    check_output(out)
+    folder, replaced = result_folder(out, "grasp", "grasp.json", "grasp.png", overwrite=overwrite)
     named = named_robot(robot)
 
     from splatbot.atomic import atomic_write
     from splatbot.cli.affordances import name_backends
     from splatbot.cli.progress import steps
-    from splatbot.cli.tables import print_command
+    from splatbot.cli.tables import print_command, print_text
     from splatbot.grasping.advice import first_change
     from splatbot.grasping.affordance import find_target
     from splatbot.grasping.grasp_file import grasp_file
@@ -152,14 +154,13 @@ def grasp(
         found = find_target(hint, scene, [*name_backends(vlm=vlm), SpatialAffordance(), TagAffordance()])
         sampler = objects.sampler(arm, hand_only=hand_only, n_sigma=n_sigma, min_observations=min_observations)
         tell("auditing the error of the map")
-        margin_text = _set_margin(sampler, "0" if hand_only and margin is None else margin, map, found)
+        audited, margin_text = _set_margin(sampler, "0" if hand_only and margin is None else margin, map, found)
         if not hand_only:
             tell("collecting the obstacles of plans")
-            agree_with_plans(sampler, map, arm, arm.home, unknown)
+            agree_with_plans(sampler, map, arm, arm.home, unknown, measured=audited)
         tell(f"searching for grasps of {found.label}")
         result = objects.with_notes(sampler.sample(found, options))
     failure = None if result.grasps else first_change(result, scene, stroke_of(arm), samples)
-    folder = out if out is not None else Path("runs") / "grasp"
     folder.mkdir(parents=True, exist_ok=True)
     with atomic_write(folder / "grasp.json") as handle:
         content = grasp_file(
@@ -169,21 +170,26 @@ def grasp(
             robot=arm.name,
             joint_offsets=arm.joint_offsets,
             unknown=unknown,
+            measured=audited and not hand_only,
             failure=failure,
         )
         handle.write(json.dumps(content, indent=2).encode())
     shown = next(iter((*result.grasps, *result.doubtful)), result.best_rejected)
-    if shown is not None:
+    if shown is None:
+        (folder / "grasp.png").unlink(missing_ok=True)  # of an earlier search
+    else:
         with atomic_write(folder / "grasp.png") as handle:
             hand = [part for part in appearance(arm, shown.opening) if part.link == len(arm)]
             handle.write(grasp_png(scene, found.rows, shown, hand, arm.T_link_tcp))
+    if failure is not None:
+        print_text(f"written to {written_to(folder, replaced)}: grasp.json has the reasons of all candidates")
     if failure is not None and not verbose:
         reason, change = failure
         why = " ".join(note for note in found.notes if note.startswith("took "))
         what = f"{found.label} ({_place(found, scene)})"
         raise SplatbotError(f"cannot be grasped by {arm.name}: {reason}. {why}".strip(), field=what, hint=change)
     result.unwrap()
-    _print(arm.name, result, scene, folder, margin_text, verbose=verbose)
+    _print(arm.name, result, scene, written_to(folder, replaced), margin_text, verbose=verbose)
     if not hand_only:
         print_command(f"splatbot plan-pick --map {map} --grasp {folder / 'grasp.json'} --start home")
     return 0
@@ -287,8 +293,8 @@ def _audited(map_: Path, sampler: GraspSampler, target: Target) -> float:
     return error.in_region(means[target.rows]).quantile(CONSTANTS.confidence)
 
 
-def _set_margin(sampler: GraspSampler, margin: str | None, map_: Path, target: Target) -> str:
-    """Set the margin of a search, and describe its scope.
+def _set_margin(sampler: GraspSampler, margin: str | None, map_: Path, target: Target) -> tuple[bool, str]:
+    """Set the margin of a search; return whether it is audited, and its scope in words.
 
     Raises:
         SplatbotError: the margin is "auto", and the map has no recording that can be read.
@@ -300,12 +306,12 @@ def _set_margin(sampler: GraspSampler, margin: str | None, map_: Path, target: T
         except SplatbotError as error:
             if margin == "auto":
                 raise
-            return f"0, because the recording cannot be audited ({error.message}); {hand}"
-        return f"arm {1e3 * sampler.arm_margin:.1f} mm, the error of the map around the target; {hand}"
+            return False, f"0, because the recording cannot be audited ({error.message}); {hand}"
+        return True, f"arm {1e3 * sampler.arm_margin:.1f} mm, the error of the map around the target; {hand}"
     sampler.margin = margin_value(margin or "0")
     if sampler.margin > 0.0:
-        return f"{1e3 * sampler.margin:.1f} mm for arm and hand; {hand}"
-    return f"0, so that errors of the map are not covered; {hand}"
+        return False, f"{1e3 * sampler.margin:.1f} mm for arm and hand; {hand}"
+    return False, f"0, so that errors of the map are not covered; {hand}"
 
 
 def _place(target: Target, scene: SegmentedMap) -> str:
@@ -319,7 +325,7 @@ def _place(target: Target, scene: SegmentedMap) -> str:
     return f"{size}at {place_words((points.min(axis=0) + points.max(axis=0)) / 2)}"
 
 
-def _print(robot: str, result: GraspResult, scene: SegmentedMap, folder: Path, margin: str, *, verbose: bool) -> None:
+def _print(robot: str, result: GraspResult, scene: SegmentedMap, folder: str, margin: str, *, verbose: bool) -> None:
     from rich.table import Table
 
     from splatbot.cli.tables import print_columns, print_table, print_text

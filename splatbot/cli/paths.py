@@ -77,6 +77,35 @@ def check_output(path: Path | None, flag: str = "--out", *, folder: bool = True)
             raise OSError(error.errno, error.strerror, str(path)) from error
 
 
+def result_folder(out: Path | None, name: str, *holds: str, overwrite: bool) -> tuple[Path, bool]:
+    """Return the folder of the results of a query, and whether results of an earlier call are replaced there.
+
+    Each call replaces those in the default folder runs/NAME. A folder that the user names keeps them.
+
+    Args:
+        out: the named folder. If None, the default is used.
+        name: of the default folder in runs/.
+        holds: files that a call writes.
+        overwrite: replace results in a named folder too.
+
+    Raises:
+        InputError: the named folder holds results and ``overwrite`` is not set, or it is no folder for files.
+        OSError: the folder or its disk is not for writing.
+    """
+    folder = Path("runs") / name if out is None else out
+    check_output(folder)
+    found = [file for file in holds if (folder / file).exists()]
+    if found and out is not None and not overwrite:
+        hint = "name another folder, or give --overwrite to replace it"
+        raise InputError(f"holds earlier results ({', '.join(found)}).", file=folder, field="--out", hint=hint)
+    return folder, bool(found)
+
+
+def written_to(folder: Path, replaced: bool) -> str:
+    """Return words for the folder of results, see :func:`result_folder`."""
+    return f"{folder}, in place of earlier results" if replaced else str(folder)
+
+
 def check_new(path: Path, *, overwrite: bool) -> None:
     """Check that a path is free, or that its content may be replaced.
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from splatbot.cli.paths import check_output
+from splatbot.cli.paths import result_folder, written_to
 from splatbot.errors import InputError
 
 if TYPE_CHECKING:
@@ -32,6 +32,7 @@ def pick(
     moved: float = 0.0,
     seed: int = 0,
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
+    overwrite: bool = False,
 ) -> int:
     """Pick an object in the twin: scan, find grasps, plan, look again, approach, close, lift, check.
 
@@ -61,9 +62,10 @@ def pick(
         attempts: largest number of grasps that are executed; more than one needs --look.
         moved: distance [m] by which the target is pushed aside after the scan, to see how the pick copes.
         seed: seed of sensor noise and search.
-        out: folder to write to; by default runs/pick.
+        out: folder to write to; by default runs/pick, whose earlier results are replaced.
+        overwrite: replace the results of an earlier call in the folder that --out names.
     """
-    check_output(out)
+    folder, replaced = result_folder(out, "pick", "pick.json", overwrite=overwrite)
 
     from splatbot.atomic import atomic_write
     from splatbot.cli.affordances import name_backends
@@ -84,20 +86,19 @@ def pick(
         twin, target, backends, options,
         views=views, margin=margin, home=home, look=look, moved=moved, seed=seed,
     )  # fmt: skip
-    folder = out if out is not None else Path("runs") / "pick"
     folder.mkdir(parents=True, exist_ok=True)
     with atomic_write(folder / "pick.json") as handle:
         handle.write(json.dumps(picked.summary(), indent=2).encode())
-    _print(picked, folder)
+    _print(picked, written_to(folder, replaced))
     if not picked.result:
         raise PickError(picked.result)
     return 0
 
 
-def _print(picked: TwinPick, folder: Path) -> None:
+def _print(picked: TwinPick, folder: str) -> None:
     from splatbot.cli.tables import print_table
 
     result, target = picked.result, picked.target
     rows = [(str(step.stage), f"{step.seconds:6.2f} s  {step.note}") for step in result.steps]
     rows += [(f"{name} rose", f"{1e3 * by:+.0f} mm") for name, by in picked.rose.items() if abs(by) > 0.005]
-    print_table([*rows, ("written to", str(folder))], title=f"{target.label} ({target.backend}): {result.outcome}")
+    print_table([*rows, ("written to", folder)], title=f"{target.label} ({target.backend}): {result.outcome}")

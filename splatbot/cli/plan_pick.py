@@ -10,7 +10,7 @@ import tyro
 
 from splatbot.cli.drawing import CAMERA, draw_offscreen, film
 from splatbot.cli.grasp import graspable_objects
-from splatbot.cli.paths import check_file, check_output
+from splatbot.cli.paths import check_file, check_output, result_folder, written_to
 from splatbot.cli.placing import (
     PROPOSED_BASE,
     Pose,
@@ -44,6 +44,7 @@ def plan_pick(
     video: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
     seed: int = 0,
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
+    overwrite: bool = False,
 ) -> int:
     """Plan a complete pick in a map, and simulate it in the twin of the map before the robot moves.
 
@@ -71,11 +72,12 @@ def plan_pick(
         budget_ms: time budget of the planner for the way to each pre-grasp [ms].
         video: MP4 of the simulation.
         seed: seed of the planner, and of small displacements of the object in the twin; 0 for none.
-        out: folder to write to; by default runs/pick.
+        out: folder to write to; by default runs/pick, whose earlier results are replaced.
+        overwrite: replace the results of an earlier call in the folder that --out names.
     """
     file = map_file(map)
     check_file(grasp, "--grasp")
-    check_output(out)
+    folder, replaced = result_folder(out, "pick", "pick.json", "pick.html", overwrite=overwrite)
     check_output(video, "--video", folder=False)
     if video is not None:
         draw_offscreen()
@@ -107,7 +109,7 @@ def plan_pick(
         sampler = objects.sampler(robot, n_sigma=known.n_sigma, min_observations=known.min_observations)
         sampler.margin, sampler.arm_margin = known.margin, known.arm_margin
         tell("collecting the obstacles of plans")
-        agree_with_plans(sampler, map, robot, here, known.unknown)
+        agree_with_plans(sampler, map, robot, here, known.unknown, measured=known.measured)
         tell("planning and simulating the pick")
         scene = _scene(map, known, with_camera=video is not None)
         twin = twin_of_pick(scene, robot, sampler, known.target, seed=seed)
@@ -116,25 +118,26 @@ def plan_pick(
                 twin, sampler, known.target, grasps, options, start=here,
                 on_step=lambda step: tell(f"simulating the pick: {step.stage} is done"), watch=watch,
             )  # fmt: skip
-    folder = out if out is not None else Path("runs") / "pick"
     proposed = is_base_proposed(_base(map, known), map)
     texts = {"pick.json": json.dumps(_summary(picked, known) | {"base_proposed": proposed}, indent=2)}
     for name, motion in zip(_names(picked), picked.result.motions, strict=True):
         texts[name] = motion.trajectory.to_json()
     title = f"{known.target.label} in {map.resolve().name}"
-    facts = f"in simulation: {_verdict(picked)}"
+    facts = f"in simulation: {_verdict(picked)}; {ARM_CLEARANCE} at least {1e3 * picked.clearance.value:.1f} mm"
     texts["pick.html"] = recording_html(picked.recording, title=title, facts=facts, target=TARGET)
     replace_files(folder, {name: write_text(text) for name, text in texts.items()})
     for path in folder.glob("[0-9]-*.json"):
         if path.name not in texts:  # a motion of an earlier pick must not follow these
             path.unlink()
-    _print(picked, known, folder, proposed=proposed)
+    _print(picked, known, written_to(folder, replaced), proposed=proposed)
     if not picked:
         first = picked.problems[0].split("; ")[0].rstrip(".")  # the table has all of them
         raise SplatbotError(f"should not be executed: {first}.", field="pick", hint=_HINT)
     return 0
 
 
+ARM_CLEARANCE = "clearance of the arm without its hand"
+"""Name of the clearance of the links before the hand, which comes close to the target on purpose."""
 _HINT = (
     "try another grasp (`--grasp-index`), mark the target alone where objects touch (`splatbot grasp --mask`), "
     "or map the scene from more sides"
@@ -213,7 +216,7 @@ def _verdict(picked: MapPick) -> str:
     return "; ".join(picked.problems)
 
 
-def _print(picked: MapPick, known: GraspFile, folder: Path, *, proposed: bool) -> None:
+def _print(picked: MapPick, known: GraspFile, folder: str, *, proposed: bool) -> None:
     from splatbot.cli.tables import print_table, print_text
     from splatbot.planning.timing import clearance_text
 
@@ -229,6 +232,6 @@ def _print(picked: MapPick, known: GraspFile, folder: Path, *, proposed: bool) -
     rows.append(("verdict", _verdict(picked) if result else str(result.outcome)))  # a row above has the reason
     if near.part:
         where = f"{picked.words(near.part)} and {near.other} at {near.time:.1f} s"
-        rows.append(("nearest in the twin", f"{1e3 * near.value:.1f} mm, {where}; without the hand"))
-    print_table([*rows, ("written to", str(folder))], title=f"pick of {known.target.label}")
+        rows.append(("nearest in the twin", f"{ARM_CLEARANCE} {1e3 * near.value:.1f} mm: {where}"))
+    print_table([*rows, ("written to", folder)], title=f"pick of {known.target.label}")
     print_text("the twin assumes 0.2 kg, a friction coefficient of 0.8, and the completed shape of the target")

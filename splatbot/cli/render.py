@@ -65,8 +65,8 @@ def render(
         mode: colour, depth, surface normals or opacity.
         out: PNG to write; by default NAME-MODE.png here.
         pose: T_world_camera: position [m] and quaternion (w x y z); camera axes x right, y down, z forward.
-        look_from: place of the camera instead of --pose [m]. The frame is that of the map: its first camera's, with x right,
-            y down, z forward. The camera is upright, by the scene.yaml next to the map if there is one.
+        look_from: place of the camera instead of --pose [m]. The frame is that of the map: its first camera's, with x
+            right, y down, z forward. The camera is upright, by the scene.yaml next to the map if there is one.
         look_at: point in the middle of the image [m], in the same frame.
         trajectory: TUM file to take the pose from, with --index. A run folder brings its own.
         index: which pose of the trajectory, from 0; -1 is the last.

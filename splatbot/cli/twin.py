@@ -43,8 +43,9 @@ def twin(
 ) -> int:
     """Simulate a motion in the physics of a scene before the robot moves.
 
-    The output reports tracking error, contacts, clearance and dropped objects. It lists the active physics effects with
-    reason and cost; only effects that the scene needs are active. The exit code is 1 after an unintended contact.
+    The output begins with the verdict, and reports tracking error, contacts, clearance and dropped objects. It ends
+    with the active physics effects, their reasons and costs; only effects that the scene needs are active. The exit
+    code is 1 after an unintended contact.
 
     Examples:
         splatbot twin --list
@@ -112,13 +113,14 @@ def twin(
         result = it.follow(motion, progress=show, watch=_watchers(shown, recording))
         sensor = shown.report() if shown is not None else []
     entries = ledger(it, result, motion, costs=not no_costs, sensor=sensor)
+    harm = _harm(chosen, result)
     if json is not None:
         _write(json, result, entries, sensor)
     if html is not None and recording is not None:
         _write_page(html, recording, result)
     if not quiet:
-        _print(result, entries, [path for path in (video, html) if path is not None])
-    return 1 if _harm(chosen, result) else 0
+        _print(result, harm, entries, [path for path in (json, video, html) if path is not None])
+    return 1 if harm else 0
 
 
 def _scene(name: str | None, map: Path | None, base: Pose | None, *, with_camera: bool) -> Scene:
@@ -218,13 +220,15 @@ def _write(path: Path, result: TwinResult, entries: list[LedgerEntry], sensor: l
         file.write(text.dumps(values, indent=1).encode() + b"\n")
 
 
-def _print(result: TwinResult, entries: list[LedgerEntry], written: list[Path]) -> None:
+def _print(result: TwinResult, harm: bool, entries: list[LedgerEntry], written: list[Path]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from splatbot.cli.tables import print_columns
+    from splatbot.cli.tables import print_columns, print_text
 
     console = Console(width=None if sys.stdout.isatty() else 140)
+    style = "bold red" if harm else "bold green"
+    console.print(f"verdict: {_verdict(result, harm)}", style=style, markup=False, highlight=False)
     console.print(
         f"{result.scene}: {result.duration:.2f} s in {result.steps} steps of {1e3 * result.timestep:g} ms, "
         f"{_pace(result.real_time)}"
@@ -239,8 +243,6 @@ def _print(result: TwinResult, entries: list[LedgerEntry], written: list[Path]) 
     near = result.clearance
     where = f" ({near.part} and {near.other} at {near.time:.2f} s)" if near.part else " or more"
     console.print(f"minimum clearance of the arm: {1e3 * near.value:.1f} mm{where}")
-    if not result.contacts and near.part:
-        console.print("no contact of the arm")
     for contact in result.contacts:
         console.print(
             f"contact: {contact.part} and {contact.other}, {contact.first:.3f} to {contact.last:.3f} s, "
@@ -250,14 +252,35 @@ def _print(result: TwinResult, entries: list[LedgerEntry], written: list[Path]) 
         console.print(f"fell: {name}")
     for text in result.warnings:
         console.print(f"[yellow]warning: {text}[/yellow]")
-    table = Table("effect", "on", "why", "ms", "us a step")
-    for entry in sorted(entries, key=lambda entry: not entry.on):  # active ones first
-        cost = ("", "") if entry.ms is None else (f"{entry.ms:+.1f}", f"{entry.us_per_step:+.2f}")
-        if entry.on or entry.observable or entry.by != "scene":  # leaves out effects that no sensor names
-            table.add_row(entry.name, "on" if entry.on else "-", entry.why, *cost)
-    print_columns(table, console)
     for path in written:
         console.print(f"written to {path}")
+    table = Table("effect", "why", "ms", "us a step", title="active effects", title_justify="left")
+    for entry in entries:
+        cost = ("", "") if entry.ms is None else (f"{entry.ms:+.1f}", f"{entry.us_per_step:+.2f}")
+        if entry.on:
+            table.add_row(entry.name, entry.why, *cost)
+    if table.row_count:
+        print_columns(table, console)
+    overruled = [f"{entry.name} ({entry.why})" for entry in entries if not entry.on and entry.by != "scene"]
+    if overruled:
+        print_text(f"inactive: {', '.join(overruled)}")
+    unneeded = [entry.name for entry in entries if not entry.on and entry.by == "scene" and entry.observable]
+    if unneeded:
+        print_text(f"not needed here: {', '.join(unneeded)}; --json FILE has the reasons")
+
+
+def _verdict(result: TwinResult, harm: bool) -> str:
+    """Return one line on the run: contacts, stability and fallen objects, and whether they forbid to execute it."""
+    touched = dict.fromkeys(f"{contact.part} and {contact.other}" for contact in result.contacts)
+    if harm:
+        unstable = [text for text in result.warnings if "unstable" in text]
+        found = [*unstable, *(f"unintended contact of {pair}" for pair in touched)]
+        text = f"do not execute: {'; '.join(found)}"
+    elif touched:
+        text = f"contacts, which the task allows: {', '.join(touched)}"
+    else:
+        text = "no contact of the arm"
+    return f"{text}; fell: {', '.join(result.dropped)}" if result.dropped else text
 
 
 def _pace(real_time: float) -> str:

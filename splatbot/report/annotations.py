@@ -24,6 +24,7 @@ class AnnotationConstants:
         badge: [px] least distance between two numbers along an axis.
         turns: places around a centre that are tried for a number, from inside to outside.
         ring: [px] radius of a ring.
+        dot: [px] radius of the dot at the start of an arrow.
         bars: [m] lengths of which a scale bar takes the largest that fills at most a fifth of the width.
     """
 
@@ -33,6 +34,7 @@ class AnnotationConstants:
     badge: tuple[int, int] = (34, 26)
     turns: int = 2000
     ring: int = 14
+    dot: int = 5
     bars: tuple[float, ...] = (1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01)
 
 
@@ -105,6 +107,17 @@ def with_ring(image: NDArray[np.float32], place: tuple[float, float], color: Col
     center = (round(place[0]), round(place[1]))
     for shade, width in ((_DARK, 6), (_shade(color), 3)):
         cv2.circle(marked, center, CONSTANTS.ring, shade, width, cv2.LINE_AA)
+    return _floats(marked)
+
+
+def with_arrows(image: NDArray[np.float32], arrows: Sequence[tuple[Array, Array, Color]]) -> NDArray[np.float32]:
+    """Return an image (H, W, 3) in 0..1 with arrows in front of everything: from (u, v) with a dot, to (u, v) [px]."""
+    marked = _bytes(image)
+    for start, end, color in arrows:
+        tail, head = ((round(float(u)), round(float(v))) for u, v in (start, end))
+        for shade, wide in ((_DARK, 3), (_shade(color), 0)):
+            cv2.arrowedLine(marked, tail, head, shade, 2 + wide, cv2.LINE_AA, tipLength=0.3)
+            cv2.circle(marked, tail, CONSTANTS.dot + wide // 2, shade, -1, cv2.LINE_AA)
     return _floats(marked)
 
 

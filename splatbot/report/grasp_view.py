@@ -16,15 +16,14 @@ from splatbot.geometry import inverse, look_at, transform_points
 from splatbot.grasping.types import Grasp
 from splatbot.protocols import Array
 from splatbot.rasterize.views import to_png
-from splatbot.report.annotations import Color, with_legend, with_scale
+from splatbot.report.annotations import Color, with_arrows, with_legend, with_scale
 from splatbot.report.robot_drawing import DrawnPart, draw_robot, map_view
-from splatbot.report.sphere_gaussians import sphere_gaussians
 from splatbot.segmentation import SegmentedMap
 
 _MEASURED, _IMPLIED, _TARGET = (0.1, 0.9, 0.2), (1.0, 0.9, 0.1), (0.95, 0.5, 0.1)
 _LEGEND: list[tuple[str, Color]] = [
     ("target, as the map has it", _TARGET),
-    ("contact at measured depth, and its normal", _MEASURED),
+    ("contact at measured depth, and its normal, in front of the hand", _MEASURED),
     ("implied contact, not measured", _IMPLIED),
     ("hand at the grasp; paler at the pre-grasp", (0.6, 0.62, 0.65)),
 ]
@@ -37,10 +36,12 @@ class GraspViewConstants:
     Args:
         camera_distance: [m] distance from the camera to the target.
         crop_radius: [m] radius of the map around the target that is drawn.
+        normal_length: [m] length of the arrows along the normals of the contacts.
     """
 
     camera_distance: float = 0.5
     crop_radius: float = 0.6
+    normal_length: float = 0.03
 
 
 CONSTANTS = GraspViewConstants()
@@ -59,7 +60,7 @@ def grasp_png(
     width: int = 1280,
     height: int = 480,
 ) -> bytes:
-    """Render two views: the tinted target, the hand at grasp and pre-grasp (transparent), and contacts.
+    """Render two views: the tinted target, the hand at grasp and pre-grasp (transparent), and contacts in front.
 
     Args:
         scene: the map.
@@ -72,13 +73,9 @@ def grasp_png(
     model = _tinted(scene.model, rows)
     middle = grasp.contacts.mean(axis=0)
     near = np.linalg.norm(model.means.double().numpy() - middle, axis=1) < CONSTANTS.crop_radius
-    drawn = [model.select(torch.from_numpy(np.flatnonzero(near)))]
-    steps = np.linspace(0.004, 0.03, 8)[:, None]
-    implied = grasp.implied or (False, False)
-    for contact, normal, is_implied in zip(grasp.contacts, grasp.normals, implied, strict=True):
-        color = np.array(_IMPLIED if is_implied else _MEASURED)
-        drawn.append(sphere_gaussians(contact[None], np.full(1, 0.006), color, 0.95))
-        drawn.append(sphere_gaussians(contact + steps * normal, np.full(8, 0.0025), color, 0.95))
+    shown = model.select(torch.from_numpy(np.flatnonzero(near)))
+    colors = [_IMPLIED if implied else _MEASURED for implied in grasp.implied or (False, False)]
+    tips = grasp.contacts + CONSTANTS.normal_length * grasp.normals
     parts = [replace(part, link=0) for part in hand]
     half = width // 2
     camera = Camera(0.9 * half, 0.9 * half, (half - 1) / 2, (height - 1) / 2, half, height)
@@ -86,9 +83,11 @@ def grasp_png(
     views = []
     for side in _SIDES:
         T = scene.T_world_base @ look_at(at + CONSTANTS.camera_distance * side / np.linalg.norm(side), at)
-        view, depth = map_view(GaussianModel.concatenate(drawn), camera, T)
+        view, depth = map_view(shown, camera, T)
         for T_world_tcp, opacity in ((grasp.T_world_tcp, 1.0), (grasp.T_world_pregrasp, 0.25)):
             draw_robot(view, depth, camera, T, parts, (T_world_tcp @ inverse(T_link_tcp))[None], opacity=opacity)
+        ends = (camera.project(transform_points(inverse(T), points)) for points in (grasp.contacts, tips))
+        view = with_arrows(view, list(zip(*ends, colors, strict=True)))
         views.append(with_scale(view, camera, CONSTANTS.camera_distance, "at the target"))
     picture = np.ascontiguousarray(np.concatenate(views, axis=1))
     return to_png(with_legend(picture, _LEGEND), "rgb")

@@ -33,7 +33,7 @@ function caption(at) {
   const force = (name, found) => (found.length ? `, ${name} force ${Math.max(...found.map((contact) => contact[3])).toFixed(1)} N` : "");
   const clearance = data.clearances[at] >= data.far ? `${(1e3 * data.far).toFixed(0)} mm or more` : `${(1e3 * data.clearances[at]).toFixed(1)} mm`;
   const rise = data.rises.length ? `, target risen by ${(1e3 * data.rises[at]).toFixed(0)} mm` : "";
-  return `clearance ${clearance}${rise}${force("contact", data.contacts[at])}${force("grip", data.grips[at])}`;
+  return `${data.clearanceName} ${clearance}${rise}${force("contact", data.contacts[at])}${force("grip", data.grips[at])}`;
 }
 
 const area = { left: 48, right: 8, top: 14, bottom: 18 };  // margins of the curves in their canvas [px]

@@ -50,6 +50,22 @@ def test_ranked_grasps_are_printed_written_and_drawn(run: RunCommand, map_file: 
     assert picture.std() > 5
 
 
+def test_a_second_search_replaces_the_first_in_the_default_folder_and_says_so(
+    run: RunCommand, map_file: Path, work_folder: Path
+) -> None:
+    words = ("grasp", "--map", map_file, *BASE, "--hand-only", "--wanted", 1)
+    first = run(*words, "--target", "red box")
+    assert first.code == 0, first.err
+    assert "in place of earlier results" not in first.out
+    failed = run(*words, "--target", "largest box")  # wider than the hand
+    assert failed.code == 1
+    assert "written to runs/grasp, in place of earlier results" in failed.out
+    assert json.loads((work_folder / "runs" / "grasp" / "grasp.json").read_text())["grasps"] == []
+    named = run(*words, "--target", "red box", "--out", "runs/grasp", "--overwrite")
+    assert named.code == 0, named.err
+    assert len(json.loads((work_folder / "runs" / "grasp" / "grasp.json").read_text())["grasps"]) == 1
+
+
 def test_a_run_whose_log_is_gone_still_answers_and_notes_the_skipped_checks(
     run: RunCommand, map_file: Path, tmp_path: Path
 ) -> None:

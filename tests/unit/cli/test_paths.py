@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from splatbot.cli import main
-from splatbot.cli.paths import system_error
-from splatbot.errors import FormatError, LogError
+from splatbot.cli.paths import result_folder, system_error, written_to
+from splatbot.errors import FormatError, InputError, LogError
 from splatbot.layouts import is_map, log_kind, map_file
 from tests.unit.cli.conftest import RunCommand, assert_refused
 
@@ -321,3 +321,49 @@ def test_an_error_of_the_disk_is_a_sentence_and_exit_1(
 def test_an_error_that_is_none_of_the_disk_is_a_bug() -> None:
     assert system_error(OSError(11, "busy")) is None
     assert system_error(ConnectionResetError(104, "reset")) is None
+
+
+def test_results_in_the_default_folder_are_replaced_and_named_ones_are_kept(work_folder: Path) -> None:
+    folder = Path("runs/grasp")
+    assert result_folder(None, "grasp", "grasp.json", overwrite=False) == (folder, False)
+    assert not folder.exists()
+    for named in (folder, Path("mine")):
+        named.mkdir(parents=True)
+        (named / "grasp.png").touch()
+    assert result_folder(None, "grasp", "grasp.json", "grasp.png", overwrite=False) == (folder, True)
+    assert written_to(*result_folder(None, "grasp", "grasp.png", overwrite=False)) == (
+        "runs/grasp, in place of earlier results"
+    )
+    for named in (folder, Path("mine")):  # the default folder is named, too, if --out gives it
+        with pytest.raises(InputError, match=r"holds earlier results \(grasp.png\).*--overwrite"):
+            result_folder(named, "grasp", "grasp.json", "grasp.png", overwrite=False)
+        assert result_folder(named, "grasp", "grasp.json", "grasp.png", overwrite=True) == (named, True)
+        assert result_folder(named, "grasp", "grasp.json", overwrite=False) == (named, False)  # of another command
+
+
+@pytest.mark.parametrize(
+    ("words", "file"),
+    [
+        (("grasp", "--map", "map.ply", "--target", "box"), "grasp.json"),
+        (("plan-pick", "--map", "map.ply", "--grasp", "grasp.json"), "pick.json"),
+        (("plan-pick", "--map", "map.ply", "--grasp", "grasp.json"), "pick.html"),
+        (("pick", "tabletop_clutter", "--target", "can"), "pick.json"),
+    ],
+)
+def test_results_in_a_named_folder_are_kept_before_the_libraries_load(
+    words: tuple[str, ...], file: str, work_folder: Path
+) -> None:
+    (work_folder / "map.ply").write_bytes(b"ply\n")
+    (work_folder / "grasp.json").write_text('{"robot": "panda"}')
+    (work_folder / "kept").mkdir()
+    (work_folder / "kept" / file).write_text("of an earlier call")
+    program = (
+        "import sys; from splatbot.cli import main; code = main(sys.argv[1:]); "
+        "sys.exit(code if 'torch' not in sys.modules and 'mujoco' not in sys.modules else 99)"
+    )
+    command = [sys.executable, "-c", program, *words, "--out", "kept"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=work_folder)
+    assert done.returncode == 2, done.stderr
+    assert f"kept: --out: holds earlier results ({file})" in done.stderr
+    assert "--overwrite" in done.stderr
+    assert (work_folder / "kept" / file).read_text() == "of an earlier call"

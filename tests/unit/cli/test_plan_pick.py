@@ -54,7 +54,16 @@ def test_the_box_is_held_in_the_twin_and_each_motion_clears_the_true_objects(
     assert written["simulated"]["rose_m"] == pytest.approx(0.15, abs=0.01)
     assert not written["simulated"]["contacts"]
     assert (written["simulated"]["outcome"], written["simulated"]["reason"]) == ("picked", "")
-    drawn = document((out / "pick.html").read_text())
+    page = (out / "pick.html").read_text()
+    drawn = document(page)
+    nearest = (
+        f"clearance of the arm without its hand at least {1e3 * written['simulated']['clearance']['value']:.1f} mm"
+    )
+    assert nearest in page
+    assert drawn["clearanceName"] == "clearance of arm and hand"
+    assert min(drawn["clearances"]) < written["simulated"]["clearance"]["value"]  # the hand is nearer than the links
+    assert "clearance of arm and hand, in the curve" in page
+    assert nearest.replace(" at least", "") in " ".join(answer.out.split())
     assert not any(drawn["contacts"])  # as in pick.json
     assert any(drawn["grips"])
     assert drawn["rises"][-1] == pytest.approx(written["simulated"]["rose_m"], abs=0.005)

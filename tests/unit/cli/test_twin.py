@@ -17,6 +17,7 @@ from splatbot.robots.panda import panda
 from splatbot.sim.effects.physics import PHYSICS
 from splatbot.sim.effects.registry import EFFECTS
 from splatbot.workspace import Workspace
+from tests.terminal import at_a_terminal
 from tests.unit.cli.conftest import RunCommand, assert_refused
 
 pytest.importorskip("mujoco")
@@ -34,6 +35,24 @@ def test_the_result_holds_tracking_touches_and_the_ledger_with_costs(run: RunCom
     assert effects["backlash"]["ms"] is None
     assert all(isinstance(entry["ms"], float) for entry in effects.values() if entry["on"])
     assert "minimum clearance of the arm" in answer.out
+    assert f"written to {tmp_path / 'r.json'}" in answer.out
+
+
+def test_the_verdict_is_the_first_line_and_inactive_effects_are_one_line_at_the_end() -> None:
+    shown = at_a_terminal("twin", "--scene", "wiping", "--forbid", "backlash", "--no-costs", columns=80)
+    assert shown.code == 0, shown.text
+    assert shown.longest_line() <= 80
+    text = " ".join(shown.text.split())
+    assert text.index("verdict: contacts, which the task allows: finger1 and board") < text.index("wiping: 3.00 s")
+    assert text.index("wiping: 3.00 s") < text.index("minimum clearance")
+    assert text.index("minimum clearance") < text.index("active effects") < text.index("inactive: backlash (forbidden")
+    assert text.index("torque_limits") < text.index("not needed here: soft_bodies, ")
+    assert "everything is rigid" not in text  # the reason of soft_bodies, which --json has
+
+
+def test_a_run_without_contact_says_so_first(run: RunCommand) -> None:
+    answer = run("twin", "--scene", "empty", "--no-costs")
+    assert (answer.code, answer.out.splitlines()[0]) == (0, "verdict: no contact of the arm")
 
 
 def test_an_arm_that_touches_the_map_ends_with_1(run: RunCommand, tmp_path: Path) -> None:
@@ -44,6 +63,7 @@ def test_an_arm_that_touches_the_map_ends_with_1(run: RunCommand, tmp_path: Path
     (tmp_path / "plan.csv").write_text("\n".join([",".join(header), *rows]))
     answer = run("twin", "--map", tmp_path / "map.ply", "--trajectory", tmp_path / "plan.csv", "--no-costs")
     assert answer.code == 1
+    assert answer.out.startswith("verdict: do not execute: unintended contact of ")
     assert "contact: " in answer.out
     assert " and map" in answer.out
     assert "Gaussians as" in answer.out
