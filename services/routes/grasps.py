@@ -44,6 +44,7 @@ _ANSWER = {
     "arm_margin_m": 0.006,
     "margin_source": "audited error of the map where the arm moves",
     "unknown_space": "free",
+    "measured_surface": True,
 }
 _Body = Annotated[GraspsRequest, Depends(body_of(GraspsRequest))]
 
@@ -72,7 +73,7 @@ def grasps(request: Request, served: ServedAfterFrames, service: Service, query:
         sampler.arm_margin = source.error.in_region(means[found.rows]).quantile(MARGIN.confidence)
     if not query.hand_only:
         most = max(sampler.margin, sampler.arm_margin)
-        around = plan_obstacles(served, robot, base, robot.home, policy=query.unknown)
+        around = plan_obstacles(served, robot, base, robot.home, policy=query.unknown, measured=source.audited)
         sampler.agree_with_plans(around.field(most), around.unknown_field(most))
     options = GraspOptions(
         friction=query.friction,
@@ -91,6 +92,7 @@ def grasps(request: Request, served: ServedAfterFrames, service: Service, query:
         "arm_margin_m": max(sampler.margin, sampler.arm_margin),
         "margin_source": source.why,
         "unknown_space": query.unknown,
+        "measured_surface": source.audited and not query.hand_only,
     }
     return answer(request, summary(result) | said | {"map_version": served.map_version})
 

@@ -176,9 +176,9 @@ def map_obstacles(
 
 
 def agree_with_plans(
-    sampler: GraspSampler, map_: Path, robot: RobotModel, start: ArrayLike, policy: UnknownPolicy
+    sampler: GraspSampler, map_: Path, robot: RobotModel, start: ArrayLike, policy: UnknownPolicy, *, measured: bool
 ) -> None:
-    """Limit the pre-grasps of a sampler to ends of plans from ``start`` (J,); for errors see :func:`map_obstacles`."""
+    """Limit the pre-grasps of a sampler to ends of plans from ``start`` (J,); see :func:`map_obstacles`."""
     import numpy as np
 
     from splatbot.collision import GaussianCollisionField, RobotSpheres
@@ -188,7 +188,8 @@ def agree_with_plans(
     model, most = GaussianModel.load(map_file(map_)), max(sampler.margin, sampler.arm_margin)
     field = GaussianCollisionField(model, min_observations=sampler.min_observations)
     spheres = RobotSpheres(robot, T_world_base=sampler.scene.T_world_base)
-    around = map_obstacles(map_, field, model, spheres, np.asarray(start, dtype=np.float64), unknown=policy)
+    here = np.asarray(start, dtype=np.float64)
+    around = map_obstacles(map_, field, model, spheres, here, unknown=policy, measured=measured)
     sampler.agree_with_plans(around.field(most), around.unknown_field(most))
 
 

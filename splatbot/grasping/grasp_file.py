@@ -40,6 +40,7 @@ class GraspFile:
         failure: without grasps, the reason and the change to try first.
         margin, arm_margin: clearance [m] of the whole arm, and of the links before the hand.
         unknown: treatment of unknown space.
+        measured: whether measured surface that the map lacks is an obstacle of plans.
         n_sigma: surface of a Gaussian, in standard deviations.
         min_observations: least number of keyframes that support a Gaussian.
         map_sha256: hash of the map's file.
@@ -56,6 +57,7 @@ class GraspFile:
     margin: float
     arm_margin: float
     unknown: UnknownPolicy
+    measured: bool
     n_sigma: float
     min_observations: int
     map_sha256: str
@@ -98,6 +100,7 @@ class GraspFile:
             margin=float(values["margin_m"]),
             arm_margin=float(values["arm_margin_m"]),
             unknown=values["unknown_space"],
+            measured=bool(values.get("measured_surface", False)),  # earlier versions had no such obstacles
             n_sigma=float(values["n_sigma"]),
             min_observations=int(values["min_observations"]),
             map_sha256=str(values["map_sha256"]),
@@ -180,6 +183,7 @@ def grasp_file(
     robot: str,
     joint_offsets: Sequence[float],
     unknown: UnknownPolicy,
+    measured: bool,
     failure: tuple[str, str] | None,
 ) -> dict[str, Any]:
     """Return the content of a file of grasps as JSON values.
@@ -191,6 +195,7 @@ def grasp_file(
         robot: name of the robot.
         joint_offsets: (J,) offsets of its joints in the scene [rad or m]; empty without them.
         unknown: treatment of unknown space.
+        measured: whether measured surface that the map lacks is an obstacle of plans.
         failure: without grasps, the reason and the change to try first.
     """
     T = sampler.scene.T_world_base
@@ -201,6 +206,7 @@ def grasp_file(
         "margin_m": sampler.margin,
         "arm_margin_m": max(sampler.margin, sampler.arm_margin),
         "unknown_space": unknown,
+        "measured_surface": measured,
         "n_sigma": sampler.n_sigma,
         "min_observations": sampler.min_observations,
         "map_sha256": sha256(map_file),
