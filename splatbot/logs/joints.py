@@ -114,8 +114,8 @@ class JointStates:
     def at(self, stamp: float) -> tuple[tuple[str, ...], NDArray[np.float64]] | None:
         """Interpolate all joints that are known at a stamp [s]: names, and positions (J,) [rad or m]; see JointRecord.
 
-        Of several publishers of a joint, the one with the message nearest in time counts. Joints without names are only
-        those of the first publisher without names, and only if no joint has a name.
+        If several publishers have a joint, the message nearest in time counts. Joints without names are only those of
+        the first publisher without names, and only if no joint has a name.
         """
         named: dict[str, tuple[float, float]] = {}  # time [s] to the nearest message, and position
         unnamed: NDArray[np.float64] | None = None

@@ -231,7 +231,7 @@ def test_each_depth_pixel_has_the_colour_where_librealsense_projects_its_point(
             if 2 < x < WIDTH - 3 and 2 < y < HEIGHT - 3 and frame.depth[v, u] > 0:
                 errors.append(np.abs(frame.rgb[v, u, :2] - np.array([x, 2 * y])).max())
     assert len(errors) > 150
-    assert max(errors) < 2.5
+    assert max(errors) < 1.5
 
 
 def test_a_lens_of_another_model_is_refused_with_its_name(tmp_path: Path) -> None:
