@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from splatbot.cli.paths import check_file, check_output
+from splatbot.cli.paths import check_file, result_folder, written_to
 from splatbot.cli.placing import (
     PROPOSED_BASE,
     Pose,
@@ -64,6 +64,7 @@ def plan(
     seed: int = 0,
     seen_from: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None,
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
+    overwrite: bool = False,
 ) -> int:
     """Plan a path of an arm among the Gaussians of a map.
 
@@ -102,7 +103,8 @@ def plan(
         seed: seed of the search.
         seen_from: place of the camera of plan.png [m, base]; a map is sharp from where it was recorded. By default the
             camera stands above the side of the base.
-        out: folder to write to; by default runs/plan.
+        out: folder to write to; by default runs/plan, whose earlier results are replaced.
+        overwrite: replace the results of an earlier call in the folder that --out names.
     """
     if [goal, goal_pose, grasp].count(None) != 2:
         flags = "--goal, --goal-pose, --grasp"
@@ -111,7 +113,7 @@ def plan(
         raise InputError(f"is {speed:g}.", field="--speed", hint="give a fraction of the limits, above 0, at most 1")
     file = map_file(map)
     check_file(grasp, "--grasp")
-    check_output(out)
+    folder, replaced = result_folder(out, "plan", "plan.json", overwrite=overwrite)
     named = named_robot(robot)
     for words, flag in ((start, "--start"), (goal or ("home",), "--goal")):
         joint_values(words, named, flag)
@@ -173,7 +175,6 @@ def plan(
             tell=tell,
         )
     result, trajectory = found.result, found.trajectory
-    folder = out if out is not None else Path("runs") / "plan"
     if result.path is None:
         _draw_refusal(folder / "refused.png", model, around, arm, found.planner, result, here, wanted)
     around.check(result)
@@ -209,7 +210,7 @@ def plan(
         picture = plan_png(model, found.planner.arm, trajectory, *of_arm, nearest=nearest, seen_from=eye)
         replace_files(folder, writers | {"plan.png": write_bytes(picture)})
         (folder / "refused.png").unlink(missing_ok=True)  # of an earlier plan
-    _print(arm.name, result, trajectory, covers, nearest, folder)
+    _print(arm.name, result, trajectory, covers, nearest, written_to(folder, replaced))
     if grasp is not None:
         print_text("the approach to the grasp is not part of this plan; see `splatbot plan-pick` for the whole pick")
     of_plan = f"--map {map} --robot {robot}{base_words(base)} --trajectory {folder / 'trajectory.json'}"
@@ -331,7 +332,7 @@ def _print(
     trajectory: JointTrajectory,
     covers: dict[str, Any],
     nearest: ClosestApproach | None,
-    folder: Path,
+    folder: str,
 ) -> None:
     from splatbot.cli.tables import print_table
     from splatbot.planning.timing import clearance_text
@@ -360,7 +361,7 @@ def _print(
         ("measured", _MEASURED[covers["measured_surface"]]),
         ("unknown space", _UNKNOWN[covers["unknown_space"]]),
         ("margin", _margin_text(covers)),
-        ("written to", str(folder)),
+        ("written to", folder),
     ]
     print_table(rows, title="planned")
 

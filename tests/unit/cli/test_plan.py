@@ -170,12 +170,21 @@ def test_a_base_that_stands_in_the_map_is_reported(run: RunCommand, map_file: Pa
     assert "more of the mounted link than its foot is in the map; check --base" in answer.out
 
 
+def test_a_plan_in_a_named_folder_is_kept_without_overwrite(run: RunCommand, map_file: Path, tmp_path: Path) -> None:
+    (tmp_path / "plan.json").write_text("{}")
+    answer = run("plan", "--map", map_file, *BASE, "--start", "home", "--goal", *GOAL, "--out", tmp_path)
+    assert answer.code == 2
+    assert "holds earlier results (plan.json)" in answer.err
+    assert "--overwrite" in answer.err
+    assert [path.name for path in tmp_path.iterdir()] == ["plan.json"]
+
+
 @pytest.mark.long
 def test_a_map_with_harmonics_and_a_support_plane_is_planned_in_and_drawn(run: RunCommand, tmp_path: Path) -> None:
     model = tabletop().gaussians(4000)
     replace(model, sh=model.sh.repeat(1, 16, 1) * 0.1).save(tmp_path / "map.ply")
     Workspace(T_world_base=np.eye(4), support_plane=np.array([0.0, 0.0, 1.0, 0.0])).save(tmp_path / "scene.yaml")
-    words = ("plan", "--map", tmp_path / "map.ply", "--start", "home", "--out", tmp_path / "out")
+    words = ("plan", "--map", tmp_path / "map.ply", "--start", "home", "--out", tmp_path / "out", "--overwrite")
     answer = run(*words, "--goal", *GOAL)
     assert answer.code == 0, answer.err
     covers = json.loads((tmp_path / "out" / "plan.json").read_text())["covers"]
