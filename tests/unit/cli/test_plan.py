@@ -171,12 +171,14 @@ def test_a_base_that_stands_in_the_map_is_reported(run: RunCommand, map_file: Pa
 
 
 def test_a_plan_in_a_named_folder_is_kept_without_overwrite(run: RunCommand, map_file: Path, tmp_path: Path) -> None:
-    (tmp_path / "plan.json").write_text("{}")
-    answer = run("plan", "--map", map_file, *BASE, "--start", "home", "--goal", *GOAL, "--out", tmp_path)
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "plan.json").write_text("{}")
+    answer = run("plan", "--map", map_file, *BASE, "--start", "home", "--goal", *GOAL, "--out", out)
     assert answer.code == 2
     assert "holds earlier results (plan.json)" in answer.err
     assert "--overwrite" in answer.err
-    assert [path.name for path in tmp_path.iterdir()] == ["plan.json"]
+    assert [path.name for path in out.iterdir()] == ["plan.json"]
 
 
 @pytest.mark.long
