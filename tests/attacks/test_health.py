@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import httpx
 import numpy as np
@@ -19,11 +20,12 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from splatbot.gaussians import GaussianModel, Snapshot
-from splatbot.services.queues import AT_ONCE
+from splatbot.services.queues import AT_ONCE, Queues
 from splatbot.services.settings import ServiceSettings
 from splatbot.services.store import MapStore
 from splatbot.serving import serving
 from tests.contracts.conftest import Service, running, wall
+from tests.waiting import until
 
 URGENT = (("GET", "/healthz"), ("GET", "/readyz"), ("GET", "/metrics"), ("POST", "/v1/stop"))
 
@@ -74,12 +76,21 @@ class Blocked:
             thread.join(30)
 
 
+def waiting(service: Service, kind: str) -> int:
+    """Return the number of requests of a kind that wait for a place."""
+    layer: Any = service.app.middleware_stack
+    while not isinstance(layer, Queues):
+        layer = layer.app
+    return layer._waiting[kind]
+
+
 @pytest.mark.parametrize("path", ["/v1/maps/x/plans", "/slow"])
 def test_health_metrics_and_stop_do_not_wait_behind_work(served: Service, path: str) -> None:
     with Blocked(served, path, 64) as blocked:
-        for _ in range(AT_ONCE["plans" if "plans" in path else "others"]):
+        kind = "plans" if "plans" in path else "others"
+        for _ in range(AT_ONCE[kind]):
             assert blocked.entered.acquire(timeout=20)
-        time.sleep(0.2)
+        until(lambda: waiting(served, kind) == 64 - AT_ONCE[kind])
         for method, urgent in URGENT:
             begin = time.monotonic()
             response = served.client.request(method, urgent, timeout=5)
@@ -104,7 +115,7 @@ def test_a_full_queue_is_503_with_a_time_to_come_again() -> None:
     ):
         for _ in range(AT_ONCE["plans"]):
             assert blocked.entered.acquire(timeout=20)
-        time.sleep(0.3)
+        until(lambda: waiting(service, "plans") == 2)
         refused = service.client.get("/v1/maps/x/plans")
         assert (refused.status_code, refused.headers["retry-after"]) == (503, "1")
         assert "2 requests of the kind 'plans' wait" in refused.json()["detail"]
@@ -114,9 +125,10 @@ def test_a_client_that_leaves_gives_up_its_place_in_the_queue(served: Service) -
     with Blocked(served, "/v1/maps/x/plans", AT_ONCE["plans"]) as blocked:
         for _ in range(AT_ONCE["plans"]):
             assert blocked.entered.acquire(timeout=20)
-        with other(served) as client, pytest.raises(httpx.ReadTimeout):
-            client.get("/v1/maps/x/plans", timeout=0.3)
-        time.sleep(0.3)
+        line = raw(served, f"GET /v1/maps/x/plans HTTP/1.1\r\nHost: 127.0.0.1\r\n{key_line(served)}\r\n")
+        until(lambda: waiting(served, "plans") == 1)
+        line.close()
+        until(lambda: waiting(served, "plans") == 0)
     assert not blocked.entered.acquire(timeout=1)
 
 
@@ -199,8 +211,13 @@ def test_streams_of_one_client_are_bounded() -> None:
         with pytest.raises(InvalidStatus):
             connect(service.ws("/rosbridge"))
         streams.pop().close()
-        time.sleep(0.3)
-        streams.append(connect(service.ws("/rosbridge")))
+
+        def takes_another() -> bool:
+            with contextlib.suppress(InvalidStatus):
+                streams.append(connect(service.ws("/rosbridge")))
+            return len(streams) == 3
+
+        until(takes_another)
         for stream in streams:
             stream.close()
 
@@ -291,7 +308,8 @@ def test_a_client_that_does_not_read_is_cut_off(tmp_path: Path, monkeypatch: pyt
     )
     maps.add("big", source="big.ply", state="static", snapshot=Snapshot(big, 1))
     with running(ServiceSettings(body_s=1.0), maps) as service:
-        lines = [raw(service, "GET /v1/maps/big/splats.ply HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n") for _ in range(8)]
+        request = "GET /v1/maps/big/splats.ply HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
+        lines = [raw(service, request) for _ in range(AT_ONCE["exports"] + 2)]  # two wait for those that do not read
         deadline = time.monotonic() + 120
         while answered(service, "splats") < len(lines):
             assert len(list(tmp_path.glob("splatbot-export-*"))) <= AT_ONCE["exports"]
