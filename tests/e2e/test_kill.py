@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from splatbot.cli import main
 from splatbot.results.folder import RunFolder
 from splatbot.run.state import SavedRun
 from splatbot.trajectory import Trajectory
@@ -75,9 +76,6 @@ def test_killed_at_any_time_a_run_opens_and_ends_as_if_nothing_had_happened(whol
     assert np.array_equal(after.T_world_camera, whole.T_world_camera)
 
 
-def test_resuming_with_another_configuration_is_refused(tmp_path: Path) -> None:
-    answer = subprocess.run(
-        command("--resume", str(tmp_path), "--set", "seed=3"), capture_output=True, text=True, timeout=100
-    )
-    assert answer.returncode == 2
-    assert "keeps its configuration" in answer.stderr
+def test_resuming_with_another_configuration_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["map", "--resume", str(tmp_path), "--set", "seed=3", "--quiet"]) == 2
+    assert "keeps its configuration" in capsys.readouterr().err

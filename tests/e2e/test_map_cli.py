@@ -16,7 +16,7 @@ import pytest
 from splatbot.gaussians import GaussianModel
 from splatbot.run.state import SavedRun
 from splatbot.trajectory import Trajectory
-from tests.e2e.conftest import COMMAND, N_FRAMES, metrics_of, splatbot, splatbot_here
+from tests.e2e.conftest import COMMAND, N_FRAMES, metrics_of, splatbot_here
 
 BAD = 6  # the frame that is damaged
 NAMES = {"config.yaml", "trajectory.tum", "frames.jsonl", "metrics.json", "map.ply", "report.html", "map.html", "state"}
@@ -138,7 +138,7 @@ def test_a_sound_log_is_mapped_and_the_folder_is_all_that_is_needed(sound_run: P
     assert metrics["ate_rmse_m"] < 0.005
     assert metrics["psnr_holdout_db"] > 18
     assert metrics["depth_median_m"] < 0.01
-    evaluated = splatbot("eval", sound_run, "--json")
+    evaluated = splatbot_here("eval", sound_run, "--json")
     assert evaluated.code == 0, evaluated.err
     scores = json.loads(evaluated.out)
     for name in ("ate_rmse_m", "rpe_trans_rmse_m", "psnr_holdout_db", "depth_l1_m"):
@@ -148,7 +148,7 @@ def test_a_sound_log_is_mapped_and_the_folder_is_all_that_is_needed(sound_run: P
 def test_the_map_is_rendered_near_to_what_the_camera_saw(sound_run: Path, sound_log: Path, tmp_path: Path) -> None:
     fov = 62.8  # of the synthetic camera
     out = tmp_path / "view.png"
-    answer = splatbot("render", sound_run, "--index", 7, "--size", "320x240", "--fov", fov, "--out", out)
+    answer = splatbot_here("render", sound_run, "--index", 7, "--size", "320x240", "--fov", fov, "--out", out)
     assert answer.code == 0, answer.err
     rendered, seen = (cv2.imread(str(path)) for path in (out, sorted((sound_log / "rgb").iterdir())[7]))
     assert rendered is not None
