@@ -47,6 +47,12 @@ def frames(make_log: MakeLog) -> list[Frame]:
     return list(open_log(make_log(8, period=0.1)))
 
 
+@pytest.fixture
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Has frames wait for earlier ones of other cameras as long as a busy machine needs."""
+    monkeypatch.setattr("splatbot.robots.cameras.rig._WAIT_S", 60.0)
+
+
 def rig_of(tmp_path: Path, cameras: dict[str, Given], text: str = RIG) -> CameraRig:
     """Return a rig of the given cameras by their addresses."""
     (tmp_path / "rig.yaml").write_text(text)
@@ -54,6 +60,7 @@ def rig_of(tmp_path: Path, cameras: dict[str, Given], text: str = RIG) -> Camera
     return CameraRig(tmp_path / "rig.yaml", opener)
 
 
+@pytest.mark.usefixtures("patient")
 def test_frames_come_in_the_order_of_their_stamps_with_the_names_of_their_cameras(
     tmp_path: Path, frames: list[Frame]
 ) -> None:
@@ -85,6 +92,7 @@ def test_time_offsets_and_equal_stamps_keep_the_order_of_the_file(tmp_path: Path
     assert seen == [(frame.stamp, name) for frame in first for name in ("", "table")]
 
 
+@pytest.mark.usefixtures("patient")
 def test_the_loss_of_one_camera_ends_all_after_the_frames_up_to_then(tmp_path: Path, frames: list[Frame]) -> None:
     lost = DeviceError("is gone.", file="oak://b", field="camera", hint="check its cable")
     cameras = {"oak://a": Given("oak://a", frames, 0.01), "oak://b": Given("oak://b", frames[:3], 0.01, lost)}
