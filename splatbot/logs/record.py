@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,7 @@ def record(
     sensor: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
 ) -> Path:
-    """Write colour as PNG, depth as 16-bit PNG, stamps, intrinsics, poses and, if available, joints.
+    """Write colour as PNG, depth as 16-bit PNG, stamps, intrinsics, poses and, if available, joints at both times.
 
     A frame is listed only when both of its images are on the disk. An interrupted recording is therefore a shorter but
     valid log.
@@ -66,9 +67,8 @@ def record(
     if truth is not None:
         truth.save(out / "groundtruth.txt")
     camera = None
-    columns: tuple[tuple[str, ...], int] | None = None  # names and number of the joints in the first frame with any
     (out / "depth.txt").unlink(missing_ok=True)  # of a recording that was cut off before its first colour image
-    with _LineFile(out / "depth.txt") as depths, _LineFile(out / "rgb.txt") as colors:
+    with _LineFile(out / "depth.txt") as depths, _LineFile(out / "rgb.txt") as colors, _JointLines(out) as joints:
         for number, frame in enumerate(frames):
             if camera is None:
                 camera = frame.camera
@@ -76,11 +76,7 @@ def record(
             elif frame.camera != camera:
                 raise LogError("the camera changed.", file=frame.source, field="camera", hint="record two logs")
             name = f"{number:06d}.png"
-            if frame.joints is not None:
-                if columns is None:
-                    columns = frame.joint_names, len(frame.joints)
-                    _check_names(frame)
-                _append_joints(out / JOINTS, frame, *columns)
+            joints.add(frame)
             _write_png(out / "rgb" / name, cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2BGR))
             _write_png(out / "depth" / name, _to_units(frame, depth_scale))
             # Depth first: a depth image without colour is harmless, but colour without depth is an error.
@@ -91,27 +87,59 @@ def record(
     return out
 
 
+class _JointLines(AbstractContextManager["_JointLines"]):
+    """The file `joints.txt`: positions at the times of colour and of depth, in the order of time.
+
+    Its columns are the joints of the first frame with any. A frame that lacks one of them gets no line.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / JOINTS
+        self._columns: tuple[tuple[str, ...], int] | None = None  # names and number
+        self._waiting: list[tuple[float, NDArray[np.float64]]] = []  # stamp [s] and positions of further lines
+        self._last = -np.inf  # [s] stamp of the last line
+
+    def add(self, frame: Frame) -> None:
+        """Write the positions of a frame; those at the time of a later depth image wait for the next frame."""
+        if frame.joints is None:
+            return
+        if self._columns is None:
+            self._columns = frame.joint_names, len(frame.joints)
+            _check_names(frame)
+        names, count = self._columns
+        missing = ", ".join(sorted(set(names) - set(frame.joint_names)))
+        if missing or (not names and (frame.joint_names or len(frame.joints) != count)):
+            reason = f"no {missing}" if missing else "others"
+            _log.warning("frame %d is recorded without joints: %s", frame.index, reason)
+            return
+        order = [frame.joint_names.index(name) for name in names] if names else list(range(count))
+        self._waiting.append((frame.stamp, frame.joints[order]))
+        if frame.depth_joints is not None and np.isfinite(frame.depth_joints[order]).all():
+            self._waiting.append((frame.stamp + frame.depth_delay, frame.depth_joints[order]))
+        self._write(frame.stamp)
+
+    def _write(self, until: float) -> None:
+        """Write the waiting lines up to a time [s] that are later than the last one."""
+        due = sorted((line for line in self._waiting if line[0] <= until), key=lambda line: line[0])
+        self._waiting = [line for line in self._waiting if line[0] > until]
+        for stamp, positions in due:
+            if stamp <= self._last:
+                continue
+            with _LineFile(self._path) as lines:
+                if self._columns is not None and self._columns[0] and np.isinf(self._last):
+                    lines.append(joint_header(self._columns[0]))
+                lines.append(" ".join(map(repr, (float(stamp), *positions.tolist()))))
+            self._last = stamp
+
+    def __exit__(self, *_: object) -> None:
+        self._write(np.inf)
+
+
 def _check_names(frame: Frame) -> None:
     for name in frame.joint_names:
         if not name or name.split() != [name]:
             hint = "joints.txt separates names by spaces; record an .mcap file"
             raise LogError(f"has a joint {name!r}.", file=frame.source, field="joint_names", hint=hint)
-
-
-def _append_joints(path: Path, frame: Frame, names: tuple[str, ...], count: int) -> None:
-    """Append the positions of the first frame's joints; a frame that lacks one of them gets no line."""
-    assert frame.joints is not None
-    values = dict(zip(frame.joint_names, frame.joints.tolist(), strict=True)) if frame.joint_names else {}
-    missing = ", ".join(sorted(set(names) - set(values)))
-    if missing or (not names and (frame.joint_names or len(frame.joints) != count)):
-        _log.warning("frame %d is recorded without joints: %s", frame.index, f"no {missing}" if missing else "others")
-        return
-    known = [values[name] for name in names] if names else frame.joints.tolist()
-    begins = bool(names) and not path.exists()
-    with _LineFile(path) as lines:
-        if begins:
-            lines.append(joint_header(names))
-        lines.append(" ".join(repr(float(v)) for v in (frame.stamp, *known)))
 
 
 class _LineFile:

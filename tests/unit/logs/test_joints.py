@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from splatbot.errors import InputError, LogError
 from splatbot.logs import open_log
@@ -64,6 +65,28 @@ def test_recorded_joints_are_read_with_their_frames(make_log: Callable[..., Path
         assert frame.joints is not None
         assert known.joints is not None
         np.testing.assert_array_equal(frame.joints, known.joints)
+
+
+def test_a_folder_has_the_joints_at_the_times_of_colour_and_of_depth_also_of_the_last_frame(
+    make_log: Callable[..., Path], tmp_path: Path
+) -> None:
+    def at(stamp: float) -> NDArray[np.float64]:
+        return np.array([np.sin(90 * stamp), np.cos(70 * stamp)])
+
+    delays = [0.03, -0.015, 0.02, 0.0, 0.035]  # the last depth image is 35 ms later than any joints of colour
+    frames = [
+        replace(f, depth_delay=delay, joints=at(f.stamp), joint_names=("a", "b"), depth_joints=at(f.stamp + delay))
+        for f, delay in zip(open_log(str(make_log(5, period=0.05))), delays, strict=True)
+    ]
+    unknown = replace(frames[2], depth_joints=np.array([0.1, np.nan]))
+    folder = record([*frames[:2], unknown, *frames[3:]], tmp_path / "again")
+    for k, (read, frame) in enumerate(zip(open_log(f"{folder}?pair_within=0.04"), frames, strict=True)):
+        assert read.joints is not None
+        np.testing.assert_allclose(read.joints, at(frame.stamp), atol=1e-12)
+        if k in (0, 1, 4):
+            assert read.depth_joints is not None
+            np.testing.assert_allclose(read.depth_joints, at(frame.stamp + frame.depth_delay), atol=1e-12)
+    assert len(JointRecord(folder / "joints.txt").stamps) == 8  # not at the time of the third depth image
 
 
 def test_names_of_joints_survive_a_recording_and_give_the_robots_order(
