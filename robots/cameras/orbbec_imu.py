@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from typing import Any
 
 from splatbot.imu import ImuSamples
@@ -27,6 +28,7 @@ class OrbbecImu:
     """
 
     def __init__(self, ob: Any, device: Any, color: Any, *, has_clock: bool) -> None:
+        self._error = ob.OBError
         try:
             self._pipeline = ob.Pipeline(device)
             kinds = ob.OBSensorType.GYRO_SENSOR, ob.OBSensorType.ACCEL_SENSOR
@@ -65,8 +67,9 @@ class OrbbecImu:
         return self._buffer.until(stamp, shift)
 
     def stop(self) -> None:
-        """End the samples."""
-        self._pipeline.stop()
+        """End the samples; the device may be gone."""
+        with contextlib.suppress(self._error):
+            self._pipeline.stop()
 
 
 def open_imu(ob: Any, device: Any, color: Any, name: str, *, has_clock: bool) -> OrbbecImu | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from typing import Any
 
 import numpy as np
@@ -66,9 +67,10 @@ class RealsenseImu:
         return samples
 
     def stop(self) -> None:
-        """End the samples."""
-        self._sensor.stop()
-        self._sensor.close()
+        """End the samples; the device may be gone."""
+        with contextlib.suppress(RuntimeError):
+            self._sensor.stop()
+            self._sensor.close()
 
 
 def open_imu(sensor: Any, color: Any, name: str) -> RealsenseImu | None:
@@ -90,7 +92,10 @@ def open_imu(sensor: Any, color: Any, name: str) -> RealsenseImu | None:
 
 def _nearest(sensor: Any, stream: Any, rate: int) -> Any:
     """Return the profile of a stream whose rate [Hz] is nearest to the wanted one; None without the stream."""
-    of_stream = [profile for profile in sensor.get_stream_profiles() if profile.stream_type() == stream]
+    import pyrealsense2 as rs
+
+    vectors = [profile for profile in sensor.get_stream_profiles() if profile.format() == rs.format.motion_xyz32f]
+    of_stream = [profile for profile in vectors if profile.stream_type() == stream]
     return min(of_stream, key=lambda profile: abs(profile.fps() - rate), default=None)
 
 

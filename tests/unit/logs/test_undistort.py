@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from splatbot.camera import Camera
 from splatbot.errors import CameraError
-from splatbot.logs.undistort import Undistorter, check_lens, source_pixels
+from splatbot.logs.undistort import Undistorter, check_lens, modified_source_pixels, source_pixels
 from splatbot.protocols import Array
 from tests.lenses import FISHEYE, fisheye_pixels, fisheye_rays, pinhole_rays, shelf
 
@@ -30,6 +30,22 @@ def test_thin_prisms_and_tilted_sensors_are_undone_as_opencv_projects_them(lens:
     np.testing.assert_allclose(found, want, atol=1e-3)
     plain = np.stack(source_pixels(Camera(120.0, 118.0, 81.0, 58.5, 160, 120, lens[:8])), -1)
     assert np.abs(found - plain).max() > 0.3  # the last coefficients count
+
+
+def test_the_tangential_terms_of_librealsense_are_those_of_the_radially_distorted_point() -> None:
+    k1, k2, p1, p2, k3 = lens = (0.3, -0.2, 0.02, -0.015, 0.05)
+    camera = Camera(120.0, 118.0, 81.0, 58.5, 160, 120, lens)
+    u, v = modified_source_pixels(camera)
+    for row, column in ((0, 0), (119, 3), (58, 159), (17, 120)):
+        x, y = (column - 81.0) / 120.0, (row - 58.5) / 118.0
+        r2 = x * x + y * y
+        f = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+        want = 81.0 + 120.0 * (f * x + 2 * p1 * f * x * f * y + p2 * (r2 + 2 * f * x * f * x))
+        assert u[row, column] == pytest.approx(want, abs=1e-4)
+        want = 58.5 + 118.0 * (f * y + 2 * p2 * f * x * f * y + p1 * (r2 + 2 * f * y * f * y))
+        assert v[row, column] == pytest.approx(want, abs=1e-4)
+    radial = Camera(120.0, 118.0, 81.0, 58.5, 160, 120, (k1, k2, 0.0, 0.0, k3))
+    np.testing.assert_allclose(modified_source_pixels(radial), source_pixels(radial), atol=1e-3)
 
 
 def test_a_ray_traced_fisheye_becomes_the_ray_traced_pinhole_and_no_depth_is_between_two_surfaces() -> None:

@@ -108,7 +108,8 @@ class ImuPipeline:
     """
 
     def __init__(self, R: Array, rates: tuple[int, ...] = (200, 100)) -> None:
-        self._R, self._rates, self._rate, self._sent, self.stopped = R, rates, 0, 0, False
+        self._R, self._rates, self._rate, self._sent = R, rates, 0, 0
+        self.stopped = self.lost = False
 
     def get_stream_profile_list(self, kind: str) -> Any:
         assert kind in ("gyroscope", "accelerometer")
@@ -143,6 +144,8 @@ class ImuPipeline:
 
     def stop(self) -> None:
         self.stopped = True
+        if self.lost:
+            raise OBError("device is gone")
 
 
 class Contexts:
@@ -408,12 +411,14 @@ def test_lost_images_are_counted_and_a_silent_device_is_gone(monkeypatch: pytest
 
 
 def test_a_device_that_is_unplugged_is_gone(monkeypatch: pytest.MonkeyPatch) -> None:
-    library = use(monkeypatch, Library([images(0), images(1)]))
+    imu = ImuPipeline(np.eye(3))
+    library = use(monkeypatch, Library([images(0), images(1)], imu=imu))
     frames = iter(OrbbecCamera())
     next(frames)
-    library.lost = True
+    library.lost = imu.lost = True
     with pytest.raises(DeviceError, match=r"is gone \(usb transfer failed\)"):
         next(frames)
+    assert imu.stopped
     assert library.stopped
 
 
