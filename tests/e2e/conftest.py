@@ -70,6 +70,6 @@ def log_copy(sound_log: Path, tmp_path: Path) -> Path:
 def sound_run(sound_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a finished run; not to be written to."""
     folder = tmp_path_factory.mktemp("runs") / "run"
-    answer = splatbot("map", sound_log, "--out", folder)
+    answer = splatbot("map", sound_log, "--out", folder, "--set", "mapping.final_iterations=40")
     assert answer.code == 0, answer.err
     return folder

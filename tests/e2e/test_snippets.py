@@ -40,6 +40,7 @@ from tests.unit.planning.test_timing import path_of
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = ["README.md", *(str(p.relative_to(ROOT)) for p in sorted((ROOT / "docs" / "guide").glob("*.md")))]
 LOG = "synthetic:tabletop?frames=4&width=160&height=120"
+QUICK = ("--quiet", "--set", "mapping.final_iterations=20")
 Names = dict[str, Any]
 
 
@@ -55,7 +56,7 @@ WITH_SNIPPETS = [name for name in DOCUMENTS if snippets(name)]
 def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the run ``runs/desk``, and its map as ``map.ply``."""
     folder = tmp_path_factory.mktemp("snippets")
-    assert main(["map", LOG, "--out", str(folder / "runs" / "desk"), "--quiet"]) == 0
+    assert main(["map", LOG, "--out", str(folder / "runs" / "desk"), *QUICK]) == 0
     (folder / "map.ply").write_bytes((folder / "runs" / "desk" / "map.ply").read_bytes())
     return folder
 
@@ -76,7 +77,7 @@ def _compact(desk: Path) -> Names:
 
 def _merging(desk: Path) -> Names:
     log = "synthetic:tabletop?frames=30&width=160&height=120"
-    assert main(["map", log, "--out", str(desk / "runs" / "monday"), "--no-report", "--quiet"]) == 0
+    assert main(["map", log, "--out", str(desk / "runs" / "monday"), "--no-report", *QUICK]) == 0
     shutil.copytree(desk / "runs" / "monday", desk / "runs" / "tuesday")
     return {}
 
@@ -154,9 +155,12 @@ def test_the_snippets_of_a_document_run_in_turn(name: str, desk: Path, monkeypat
 
 @pytest.fixture(scope="module")
 def served(desk: Path) -> Iterator[str]:
-    """Address of a service of the map."""
-    with serving("--map", str(desk / "runs" / "desk"), "--data", str(desk / "maps"), log=desk / "log.txt") as service:
-        yield service.url
+    """Address of a service of the map, which refines its maps briefly."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SPLATBOT_MAPPING__FINAL_ITERATIONS", "20")
+        command = serving("--map", str(desk / "runs" / "desk"), "--data", str(desk / "maps"), log=desk / "log.txt")
+        with command as service:
+            yield service.url
 
 
 def test_the_snippet_of_an_arm_moves_one_behind_rosbridge() -> None:

@@ -26,7 +26,8 @@ from splatbot.workspace import fit_workspace
 def mapped(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, GaussianModel, Array]:
     """A run of four frames, its map, and the pose of the base in it."""
     run = tmp_path_factory.mktemp("runs") / "table"
-    assert main(["map", "synthetic:tabletop?frames=4&width=160&height=120", "--out", str(run), "--quiet"]) == 0
+    words = ["map", "synthetic:tabletop?frames=4&width=160&height=120", "--out", str(run), "--quiet"]
+    assert main([*words, "--set", "mapping.final_iterations=20"]) == 0
     model = GaussianModel.load(run / "map.ply")
     T = fit_workspace(model).T_world_base
     assert T is not None
