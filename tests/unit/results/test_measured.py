@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,11 +13,13 @@ import torch
 from numpy.typing import NDArray
 
 from splatbot.cli import main
+from splatbot.cli.grasp import graspable_objects
+from splatbot.cli.placing import agree_with_plans
 from splatbot.collision import GaussianCollisionField, RobotSpheres
 from splatbot.errors import SplatbotError
 from splatbot.frame import Frame
 from splatbot.gaussians import GaussianModel
-from splatbot.geometry import inverse
+from splatbot.geometry import inverse, rotation_to_quat
 from splatbot.logs import Log
 from splatbot.planning import GaussianRRTStar
 from splatbot.protocols import Array
@@ -143,3 +147,24 @@ def test_an_end_in_measured_surface_is_refused_with_its_name_and_place(
         plan(spheres)
     assert "margin in metres" in str(refused.value)
     assert plan(spheres + np.array([0.0, 0.0, 3.0, 0.0])).covers_measured
+
+
+def test_the_way_to_a_pre_grasp_avoids_measured_surface_if_its_margin_is_audited(
+    mapped: tuple[RunFolder, GaussianModel, RobotSpheres], tmp_path: Path
+) -> None:
+    run, model, arm = mapped
+    shutil.copytree(run.path, tmp_path / "run")
+    model.save(tmp_path / "run" / "map.ply")
+    (tmp_path / "run" / "SHA256SUMS").unlink()  # the map is changed on purpose
+    T = arm.T_world_base
+    base = (*T[:3, 3].tolist(), *rotation_to_quat(T[:3, :3]).tolist())
+    sampler = graspable_objects(tmp_path / "run", base).sampler(arm.robot)
+    fields = []
+    for measured in (False, True):
+        agree_with_plans(sampler, tmp_path / "run", panda(), arm.robot.home, "free", measured=measured)
+        assert sampler.departure is not None
+        fields.append(sampler.departure)
+    without, with_surface = fields
+    spheres = surface_outside(RunFolder(tmp_path / "run"), reopen_log(run), without, arm)
+    assert len(with_surface) == len(without) + len(spheres)
+    assert with_surface.in_collision(spheres[:, :3]).all()
