@@ -52,8 +52,8 @@ def aligns_with_lens(model: Any) -> bool:
             came, pair = pairs.try_wait_for_frames(_WAIT_MS)
             if came and pair.get_color_frame() and pair.get_depth_frame():
                 aligned = np.asanyarray(rs.align(rs.stream.color).process(pair).get_depth_frame().get_data())
-                columns = np.flatnonzero(aligned.any(axis=0))
-                return bool(np.abs(columns - _AT).min() > 2)
+                if (columns := np.flatnonzero(aligned.any(axis=0))).size:
+                    return bool(np.abs(columns - _AT).min() > 2)
     finally:
         for sensor, _, _ in sensors:
             sensor.stop()
