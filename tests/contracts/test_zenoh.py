@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -33,12 +34,18 @@ CLOUD = "sensor_msgs::msg::dds_::PointCloud2_"
 @pytest.fixture
 def router() -> Iterator[tuple[str, Any]]:
     """An address, and a session that listens there."""
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        address = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-    config = zenoh.Config.from_json5(
-        f'{{mode: "router", listen: {{endpoints: ["{address}"]}}, scouting: {{multicast: {{enabled: false}}}}}}'
-    )
-    with zenoh.open(config) as session:
+    for _ in range(5):  # another process may take the port first
+        with socket.create_server(("127.0.0.1", 0)) as probe:
+            address = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+        config = zenoh.Config.from_json5(
+            f'{{mode: "router", listen: {{endpoints: ["{address}"]}}, scouting: {{multicast: {{enabled: false}}}}}}'
+        )
+        with suppress(zenoh.ZError):
+            session = zenoh.open(config)
+            break
+    else:
+        pytest.fail("no free port was found")
+    with session:
         yield address, session
 
 
