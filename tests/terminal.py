@@ -12,7 +12,7 @@ import struct
 import sys
 import termios
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -57,6 +57,7 @@ def at_a_terminal(
     columns: int,
     interrupt_at: str | None = None,
     interrupt_after_s: float | None = None,
+    interrupt_when: Callable[[], bool] | None = None,
     resize_at: tuple[str, int] | None = None,
     environment: Mapping[str, str] | None = None,
     cwd: Path | None = None,
@@ -68,6 +69,7 @@ def at_a_terminal(
         columns: width of the terminal.
         interrupt_at: press Ctrl-C once this text is shown.
         interrupt_after_s: press Ctrl-C after this time [s].
+        interrupt_when: press Ctrl-C once this is true.
         resize_at: text at which the terminal gets another width.
         environment: additional variables.
         cwd: working directory.
@@ -90,6 +92,9 @@ def at_a_terminal(
             if interrupt_after_s is not None and time.monotonic() - started > interrupt_after_s:
                 os.write(terminal, b"\x03")
                 interrupt_after_s = None
+            if interrupt_when is not None and interrupt_when():
+                os.write(terminal, b"\x03")
+                interrupt_when = None
             if not select.select([terminal], [], [], 0.2)[0]:
                 continue
             try:

@@ -130,10 +130,12 @@ def test_a_full_disk_is_a_sentence_and_keeps_the_received_part(server: FileServe
 
 
 def test_ctrl_c_keeps_the_received_part_for_the_next_call(server: FileServer, tmp_path: Path) -> None:
-    server.answers += [partial(send, pause_s=0.3)]
+    server.answers += [partial(send, pause_s=10.0)]
     words = ("download", NAME, "--out", str(tmp_path / "a"))
-    shown = at_a_terminal(*words, columns=80, interrupt_at="fetching 0/0 MB")
+    part = tmp_path / ".a.download" / "rgbd_dataset_freiburg1_rpy.tgz.part"
+    shown = at_a_terminal(*words, columns=80, interrupt_when=lambda: part.is_file() and part.stat().st_size > 0)
     assert shown.code == 130
+    assert "fetching 0/0 MB" in shown.text
     assert "the received part is kept; the same command continues" in shown.text
     assert "Traceback" not in shown.text
     shown = at_a_terminal(*words, columns=80)
