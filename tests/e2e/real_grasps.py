@@ -46,7 +46,7 @@ def check_shelf_box(log: Path, run: Path) -> None:
     for grasp in grasps:
         _held_and_free(grasp)
     out = str(run / "grasp")
-    assert main(["grasp", "--map", str(run), "--min-observations", "3", "--out", out, *marked]) == 1
+    assert main(["grasp", "--map", str(run), "--min-observations", "3", "--out", out, "--overwrite", *marked]) == 1
     assert not json.loads((run / "grasp" / "grasp.json").read_text())["grasps"]
     frame = open_log(log)[12]  # which looks straight at it
     depth = frame.depth[190:265, 240:320]
@@ -133,7 +133,7 @@ def _grasped(run: Path, *words: str, up: tuple[str, ...] = (), may_fail: bool = 
     """Run `splatbot grasp` and return the ranked grasps; the best is drawn."""
     assert (run / "scene.yaml").is_file() or main(["info", str(run), "--fit-plane", *up]) == 0
     out = run / "grasp"
-    code = main(["grasp", "--map", str(run), "--min-observations", "3", "--out", str(out), *words])
+    code = main(["grasp", "--map", str(run), "--min-observations", "3", "--out", str(out), "--overwrite", *words])
     assert code in ((0, 1) if may_fail else (0,))
     assert (out / "grasp.png").stat().st_size > 10_000
     grasps: list[dict[str, Any]] = json.loads((out / "grasp.json").read_text())["grasps"]
