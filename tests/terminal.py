@@ -56,7 +56,6 @@ def at_a_terminal(
     *words: str,
     columns: int,
     interrupt_at: str | None = None,
-    interrupt_after_s: float | None = None,
     interrupt_when: Callable[[], bool] | None = None,
     resize_at: tuple[str, int] | None = None,
     environment: Mapping[str, str] | None = None,
@@ -68,7 +67,6 @@ def at_a_terminal(
         words: of the command.
         columns: width of the terminal.
         interrupt_at: press Ctrl-C once this text is shown.
-        interrupt_after_s: press Ctrl-C after this time [s].
         interrupt_when: press Ctrl-C once this is true.
         resize_at: text at which the terminal gets another width.
         environment: additional variables.
@@ -89,9 +87,6 @@ def at_a_terminal(
     shown, started = b"", time.monotonic()
     try:
         while time.monotonic() - started < _TIMEOUT_S:
-            if interrupt_after_s is not None and time.monotonic() - started > interrupt_after_s:
-                os.write(terminal, b"\x03")
-                interrupt_after_s = None
             if interrupt_when is not None and interrupt_when():
                 os.write(terminal, b"\x03")
                 interrupt_when = None
