@@ -17,6 +17,7 @@ from splatbot.grasping.measured import CONSTANTS as MEASURED
 from splatbot.grasping.measured import RawDepth
 from splatbot.grasping.object_list import ListedObject, list_objects
 from splatbot.grasping.sampler import GraspSampler
+from splatbot.grasping.structure import find_structures
 from splatbot.grasping.types import GraspResult
 from splatbot.protocols import Array, RobotKinematics
 from splatbot.results.folder import RunFolder
@@ -122,7 +123,7 @@ def measured_map(state: Snapshot, run: RunFolder | None) -> MeasuredMap:
 def segment_objects(
     measured: MeasuredMap, T_world_base: ArrayLike, workspace: Workspace | None, *, as_known: bool
 ) -> GraspableObjects:
-    """Segment the objects of a map.
+    """Segment the objects of a map, and find which of them are structure.
 
     Args:
         measured: the map.
@@ -134,4 +135,4 @@ def segment_objects(
         InputError: the box contains no Gaussians.
     """
     scene = segment_workspace(measured.state, T_world_base, workspace, as_known=as_known, observers=measured.observers)
-    return GraspableObjects(measured, scene)
+    return GraspableObjects(measured, replace(scene, structures=find_structures(scene, measured.views)))

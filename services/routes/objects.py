@@ -33,6 +33,7 @@ _ANSWER = {
     "objects": [
         {
             "number": 0,
+            "kind": "object",
             "label": "red box",
             "target": "object 0",
             "size_m": [0.11, 0.06, 0.08],
@@ -47,6 +48,7 @@ _ANSWER = {
         },
         {
             "number": 1,
+            "kind": "object",
             "label": "grey box 1",
             "target": "object 1",
             "size_m": [0.09, 0.04, 0.07],
@@ -71,7 +73,10 @@ def _robot(
 
 @router.get("/{map_id}/objects", response_class=Response, responses=answers(_ANSWER) | problems(404, 422, 503))
 def objects(request: Request, served: Served, robot: Annotated[str, Depends(_robot)]) -> Response:
-    """List the supports and objects of a map that has a robot base; `target` names an object in POST .../grasps."""
+    """List the supports and objects of a map that has a robot base; `target` names an object in POST .../grasps.
+
+    Objects of `kind` "structure" are pieces of walls, posts or tables, with the reason as `obstacle`, and no target.
+    """
     arm = robot_in(served, robot)
     if arm.gripper is None:
         raise InputError("has no hand.", field="robot", hint="name a robot with a gripper, as panda")

@@ -31,8 +31,9 @@ def objects(
 ) -> int:
     """List the supports and objects of a map with labels and sizes, so that a target can be named.
 
-    Objects that stand on a support come first; the other clusters are often parts of the background. Writes a picture
-    with the number of each object. `splatbot grasp --target "object 3"` takes an object of the list.
+    Objects that stand on a support come first; the other clusters are often parts of the background. Pieces of walls,
+    posts and tables are structure, which words as "largest box" never take. Writes a picture with the number of each
+    object. `splatbot grasp --target "object 3"` takes an object of the list.
 
     Examples:
         splatbot objects runs/desk
@@ -129,19 +130,33 @@ def _print(found: tuple[ListedObject, ...], planes: list[dict[str, Any]]) -> Non
         rows.append((plane["label"], f"{size} m, {plane['height_base_m']:+.3f} m above the base"))
     print_table(rows, title="planes")
     for title, on_support in (("objects", True), ("clusters that stand on no support", False)):
-        chosen = [item for item in found if item.on_support == on_support]
+        chosen = [item for item in found if item.on_support == on_support and not item.structure]
         if not chosen:
             continue
         table = Table("no.", "label", "size, mm", "at, m", "hand", "reach", title=title, title_justify="left")
         for item in chosen:
-            size = "×".join(f"{1e3 * x:.0f}" for x in item.size)
-            at = " ".join(f"{x:.2f}" for x in item.at_base)
-            table.add_row(str(item.number), item.label, size, at, *_verdicts(item))
+            table.add_row(str(item.number), item.label, _size(item), _place(item), *_verdicts(item))
         print_columns(table)
+    structures = [item for item in found if item.structure]
+    if structures:
+        table = Table("no.", "size, mm", "at, m", "why", title="structure", title_justify="left")
+        for item in structures:
+            table.add_row(str(item.number), _size(item), _place(item), item.structure)
+        print_columns(table)
+        print_text("structure: no target; a name in scene.yaml makes a piece an object")
     print_text("no.: rank by the number of Gaussians, for this base and box of scene.yaml; others renumber them")
     print_text("at: the middle of the object from the base; size: long side, short side, height")
-    for verdict in dict.fromkeys(word for item in found for word in _verdicts(item) if word in _MEANINGS):
+    targets = [item for item in found if not item.structure]
+    for verdict in dict.fromkeys(word for item in targets for word in _verdicts(item) if word in _MEANINGS):
         print_text(f"{verdict}: {_MEANINGS[verdict]}")
+
+
+def _size(item: ListedObject) -> str:
+    return "×".join(f"{1e3 * x:.0f}" for x in item.size)
+
+
+def _place(item: ListedObject) -> str:
+    return " ".join(f"{x:.2f}" for x in item.at_base)
 
 
 def _verdicts(item: ListedObject) -> tuple[str, str]:

@@ -54,6 +54,8 @@ EXTENTS = {
     "brick": ((0.012, 0.35), (0.01, 0.35)),
 }
 """Usual heights and horizontal extents [m] by noun; a flat patch has those of no cup."""
+STRUCTURE = "structure"
+"""Label of a piece of a wall, post or table; see :mod:`splatbot.grasping.structure`."""
 RELATIONS = ("left of", "right of", "in front of", "behind", "next to", "near")
 _GENERIC = ("thing", "object", "one", "item", "something")
 _STOP_WORDS = (
@@ -188,7 +190,12 @@ def shape_name(scene: SegmentedMap, item: MapObject) -> str:
 
 
 def label_of(scene: SegmentedMap, item: MapObject) -> str:
-    """Return the name of an object in the scene file, else its colour, shape and number, which names it as a target."""
+    """Return the name of an object in the scene file, else its colour, shape and number, which names it as a target.
+
+    Structure has no shape of its own, and is called so.
+    """
+    if item.number in scene.structures and not item.name:
+        return f"{STRUCTURE} {item.number}"
     return item.name or f"{color_name(item)} {shape_name(scene, item)} {item.number}"
 
 
@@ -202,6 +209,7 @@ def _described(item: MapObject) -> str:
 def _scores(attributes: _ObjectAttributes, text: str) -> tuple[Array, tuple[str, ...]]:
     """Return the scores (K,) of the objects, 0..1, and a note on the applied rules."""
     scores = np.ones(len(attributes.scene.objects))
+    scores[list(attributes.scene.structures)] = 0.0  # only their labels name them
     notes: list[str] = []
     for relation in RELATIONS:
         if f" {relation} " in f" {text} ":
@@ -295,8 +303,10 @@ def _size_scores(attributes: _ObjectAttributes, word: str) -> Array:
 
 def _superlative_scores(attributes: _ObjectAttributes, word: str, among: NDArray[np.bool_]) -> Array:
     """Score objects (K,) by a superlative: 1 for the best of ``among``, decreasing with the distance from it."""
+    if not among.any():
+        return np.zeros(len(among))
     values = _measure(attributes, word)
-    best = values[among].max() if among.any() else 0.0
+    best = values[among].max()
     return np.asarray(np.exp(-(best - values) / (0.2 * max(abs(best), 1e-6))))
 
 

@@ -11,7 +11,7 @@ from splatbot.gaussians import GaussianModel
 from splatbot.geometry import inverse, transform_points
 from splatbot.grasping.hands import CONSTANTS as HANDS
 from splatbot.grasping.hands import usable_opening
-from splatbot.grasping.language import label_of
+from splatbot.grasping.language import STRUCTURE, label_of
 from splatbot.grasping.object_reach import Obstacle, out_of_reach
 from splatbot.protocols import Array, HasHand, RobotKinematics
 from splatbot.segmentation import MapObject, SegmentedMap
@@ -50,6 +50,8 @@ class ListedObject:
         of_hand: why the hand cannot enclose it: "no hand", "too flat" or "too wide". If None, it fits.
         of_arm: why the arm cannot reach it: "blocked", "no pose" or "too far". If None, it can, or the robot has
             no hand.
+        structure: why it is structure and no target, see :func:`splatbot.grasping.structure.find_structures`; empty
+            for an object.
     """
 
     number: int
@@ -61,6 +63,7 @@ class ListedObject:
     on_support: bool = True
     of_hand: Obstacle | None = None
     of_arm: Obstacle | None = None
+    structure: str = ""
 
     @property
     def fits(self) -> bool:
@@ -69,8 +72,8 @@ class ListedObject:
 
     @property
     def reach(self) -> str | None:
-        """Return "yes", or the verdict on the arm; None for a robot without a hand."""
-        if self.of_hand is not None and self.of_hand.verdict == NO_HAND:
+        """Return "yes", or the verdict on the arm; None for structure, and for a robot without a hand."""
+        if self.structure or (self.of_hand is not None and self.of_hand.verdict == NO_HAND):
             return None
         return "yes" if self.of_arm is None else self.of_arm.verdict
 
@@ -83,8 +86,9 @@ class ListedObject:
         """Return the values as JSON, each length with its unit in the name."""
         return {
             "number": self.number,
+            "kind": STRUCTURE if self.structure else "object",
             "label": self.label,
-            "target": f"object {self.number}",
+            "target": None if self.structure else f"object {self.number}",
             "size_m": self.size.round(4).tolist(),
             "center_world_m": self.at_world.round(4).tolist(),
             "center_base_m": self.at_base.round(4).tolist(),
@@ -92,8 +96,8 @@ class ListedObject:
             "on_support": self.on_support,
             "graspable_by_size": self.fits,
             "reach": self.reach,
-            "verdict": self.obstacle.verdict if self.obstacle else "fits",
-            "obstacle": self.obstacle.reason if self.obstacle else None,
+            "verdict": STRUCTURE if self.structure else self.obstacle.verdict if self.obstacle else "fits",
+            "obstacle": self.structure or (self.obstacle.reason if self.obstacle else None),
         }
 
 
@@ -111,7 +115,9 @@ def list_objects(
     T_base_world, stroke = inverse(scene.T_world_base), stroke_of(robot)
     found = []
     for item in scene.objects:
-        reached = out_of_reach(scene, item, robot, margin=margin, solids=solids) if stroke > 0.0 else None
+        structure = scene.structures.get(item.number, "")
+        sought = stroke > 0.0 and not structure
+        reached = out_of_reach(scene, item, robot, margin=margin, solids=solids) if sought else None
         found.append(
             ListedObject(
                 item.number,
@@ -123,6 +129,7 @@ def list_objects(
                 on_support=_stands(scene, item),
                 of_hand=obstacle(item, stroke),
                 of_arm=reached,
+                structure=structure,
             )
         )
     return tuple(found)

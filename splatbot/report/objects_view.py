@@ -39,13 +39,13 @@ class ObjectsViewConstants:
 
 
 CONSTANTS = ObjectsViewConstants()
-_LEFT_OUT = "{} pieces on no support or below {:.0f} mm are only in the list"
+_LEFT_OUT = "{} pieces of structure, on no support or below {:.0f} mm are only in the list"
 
 
 def objects_png(scene: SegmentedMap, found: Sequence[ListedObject], *, width: int = 1280, height: int = 800) -> bytes:
     """Render the map obliquely from above, each object numbered in its own hue; a legend gives labels and sizes.
 
-    Fragments are left out: pieces below 4 cm, and those on no support if another piece stands on one.
+    Structure and fragments are left out: pieces below 4 cm, and those on no support if another piece stands on one.
 
     Args:
         scene: the segmented map.
@@ -83,8 +83,12 @@ def objects_png(scene: SegmentedMap, found: Sequence[ListedObject], *, width: in
 
 
 def drawn_objects(found: Sequence[ListedObject]) -> list[ListedObject]:
-    """Return the objects that the picture shows: those on a support, or all without a support; none below 4 cm."""
-    standing = [item for item in found if item.on_support] or list(found)
+    """Return the objects that the picture shows: those on a support, or all without a support.
+
+    Structure and pieces below 4 cm are left out.
+    """
+    objects = [item for item in found if not item.structure]
+    standing = [item for item in objects if item.on_support] or objects
     return [item for item in standing if item.size.max() >= CONSTANTS.min_size]
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -110,6 +110,7 @@ class SegmentedMap:
         supports: all supports: the largest, and others on it or next to it, such as the seat of a stool.
         names: named places of a scene file.
         map_version: version of the map.
+        structures: objects that are structure, as pieces of walls, by number, and why; empty if that is not known.
     """
 
     model: GaussianModel
@@ -120,6 +121,7 @@ class SegmentedMap:
     supports: tuple[Support, ...] = ()
     names: tuple[NamedPlace, ...] = ()
     map_version: int = 0
+    structures: Mapping[int, str] = field(default_factory=dict)
 
     @cached_property
     def points(self) -> Array:
@@ -164,6 +166,11 @@ def solid_rows(model: GaussianModel) -> NDArray[np.bool_]:
     return np.asarray((model.opacities.detach().numpy() >= CONSTANTS.min_opacity) & (model.observations.numpy() >= 1))
 
 
+def least_gap(model: GaussianModel, rows: NDArray[np.int64], apart: float = CONSTANTS.object_distance) -> float:
+    """Return the distance [m] between objects of a map: ``apart``, or more if the Gaussians of ``rows`` are coarse."""
+    return max(apart, CONSTANTS.spacing_factor * float(model.scales[torch.from_numpy(rows)].amax(dim=1).median()))
+
+
 def segment(
     source: GaussianModel | Snapshot,
     T_world_base: ArrayLike,
@@ -204,7 +211,7 @@ def segment(
     used = np.flatnonzero(solid_rows(model) & ((points >= low - CONSTANTS.max_height) & (points <= high)).all(axis=1))
     if not len(used):
         raise InputError(f"has nothing between {low.tolist()} and {high.tolist()}.", field="map", hint="see scene.yaml")
-    apart = max(apart, CONSTANTS.spacing_factor * float(model.scales[torch.from_numpy(used)].amax(dim=1).median()))
+    apart = least_gap(model, used, apart)
     support = find_support(points[used]) if plane is None else _known(plane, T, points[used])
     above = used if support is None else used[above_support(support, points[used])]
     labels = np.full(len(model), -1, np.int32)

@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from splatbot.bench.tabletop import Block
 from splatbot.workspace import Workspace
 from tests.terminal import at_a_terminal
 from tests.unit.cli.conftest import RunCommand, assert_fix_named
-from tests.unit.grasping.objects import model
+from tests.unit.grasping.objects import BOX, colored, model
 
 
 @pytest.fixture
@@ -38,6 +39,39 @@ def test_the_json_has_the_reach_of_each_object_and_the_margin(run: RunCommand, m
     found = json.loads(run("objects", map_file, "--json").out)
     assert {item["reach"] for item in found["objects"]} == {"yes"}
     assert found["arm_margin_m"] == 0.0  # of a map file, which has no recording to audit
+
+
+@pytest.fixture
+def walled_map(tmp_path: Path) -> Path:
+    """A map whose workspace box cuts a wall, behind a box."""
+    path, wall = tmp_path / "map.ply", Block((0.8, 0.0, 0.15), (0.005, 0.6, 0.3))
+    colored({"box": BOX, "wall": wall}, 40_000, {"box": (0.8, 0.1, 0.1)}).save(path)
+    low_high = np.array([[0.2, -0.1, -0.1], [1.2, 0.15, 0.8]])
+    Workspace(T_world_base=np.eye(4), box=low_high).save(tmp_path / "scene.yaml")
+    return path
+
+
+def test_a_wall_is_listed_as_structure_apart_from_the_objects(walled_map: Path) -> None:
+    shown = at_a_terminal("objects", str(walled_map), columns=80)
+    assert shown.code == 0, shown.text
+    assert shown.longest_line() <= 80
+    objects, _, structure = shown.text.partition("\nstructure ")
+    assert "red box" in objects
+    assert "continues in other surface" in structure
+    assert "┃ why" in structure  # a table, and not a record of each piece
+    assert "red box" not in structure
+
+
+def test_the_widest_box_of_a_walled_map_is_not_the_wall(run: RunCommand, walled_map: Path, tmp_path: Path) -> None:
+    listed = json.loads(run("objects", walled_map, "--json").out)["objects"]
+    (wall,) = (item for item in listed if item["kind"] == "structure")
+    (box,) = (item for item in listed if item["kind"] == "object")
+    assert (wall["target"], box["target"]) == (None, f"object {box['number']}")
+    words = ("grasp", "--map", walled_map, "--target", "widest box", "--hand-only", "--wanted", 1)
+    answer = run(*words, "--out", tmp_path / "out")
+    assert answer.code == 0, answer.err
+    grasped = json.loads((tmp_path / "out" / "grasp.json").read_text())
+    assert np.abs(BOX.distance(np.array(grasped["grasps"][0]["contacts"]))).max() < 3e-3
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,8 @@ def test_fragments_are_left_out_of_the_picture() -> None:
     found = list_objects(scene(), panda())
     small = replace(found[0], size=np.full(3, CONSTANTS.min_size - 1e-3))
     hanging = replace(found[1], on_support=False)
-    assert drawn_objects([small, hanging, *found[2:]]) == list(found[2:])
+    wall = replace(found[2], structure="longer than 0.3 m")
+    assert drawn_objects([small, hanging, wall, *found[3:]]) == list(found[3:])
 
 
 def test_without_any_support_the_larger_pieces_are_drawn() -> None:
@@ -51,7 +52,7 @@ def test_a_picture_of_more_objects_than_its_legend_has_rows_numbers_all_and_coun
     objects_png(many, [*found, replace(item, number=0, on_support=False)])
     ((*named, more, pieces),), ((drawn, (_, tall)),) = legends, numbers
     assert more == f"and {60 - len(named)} more"
-    assert pieces.startswith("1 pieces on no support")
+    assert pieces.startswith("1 pieces of structure, on no support or below 40 mm")
     assert drawn == list(range(60))
     assert tall <= 800
 
