@@ -38,6 +38,20 @@ def imports_shown(stream: TextIO | None = None) -> Iterator[None]:
         sys.meta_path.remove(finder)
 
 
+_displays = 0  # live displays, whose line is that of the terminal
+
+
+@contextmanager
+def without_line() -> Iterator[None]:
+    """Show no line in the block, in which a live display draws the steps of a command."""
+    global _displays
+    _displays += 1
+    try:
+        yield
+    finally:
+        _displays -= 1
+
+
 class _Line:
     """The line, which nested imports share."""
 
@@ -48,8 +62,9 @@ class _Line:
 
     @contextmanager
     def shown(self) -> Iterator[None]:
-        """Show the line; other threads and forked processes do not."""
-        if threading.current_thread() is not threading.main_thread() or os.getpid() != self._process:
+        """Show the line, unless a live display is there; other threads and forked processes do not show it."""
+        foreign = threading.current_thread() is not threading.main_thread() or os.getpid() != self._process
+        if foreign or _displays:
             yield
             return
         if self._depth == 0:

@@ -10,6 +10,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from splatbot.cli.loading import without_line
+
 if TYPE_CHECKING:
     from splatbot.run import Progress
 
@@ -58,7 +60,7 @@ def shares(quiet: bool) -> Iterator[Callable[[str, float], None]]:
     from rich.console import Console
     from rich.progress import Progress
 
-    with Progress(console=Console(stderr=True), transient=True) as bars:
+    with without_line(), Progress(console=Console(stderr=True), transient=True) as bars:
         task = bars.add_task("", total=1.0)
         yield lambda what, share: bars.update(task, description=what, completed=share)
 
@@ -71,7 +73,7 @@ def steps(quiet: bool = False) -> Iterator[Callable[[str], None]]:
         return
     from rich.console import Console
 
-    with Console(stderr=True).status("") as status:
+    with without_line(), Console(stderr=True).status("") as status:
         yield lambda what: status.update(f"{what} ...")
 
 
@@ -166,7 +168,7 @@ def _live() -> Iterator[Callable[[Progress], None]]:
         transient=True,
     )
     rate = FrameRate()
-    with bars:
+    with without_line(), bars:
         task = bars.add_task("reading", total=None, counts="", numbers="", verdict="", colour="white")
 
         def show(progress: Progress) -> None:

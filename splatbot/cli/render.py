@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from splatbot.cli.loading import without_line
 from splatbot.cli.paths import check_file, check_output
 from splatbot.cli.tiled import check_tiled
 from splatbot.layouts import is_tiled_map, map_file
@@ -170,7 +171,10 @@ def _fly(model: GaussianModel, camera: Camera, path: Path, video: Path, mode: Mo
     from splatbot.trajectory import Trajectory
 
     poses = smooth_path(Trajectory.load(path), max(2, round(CONSTANTS.fps * seconds)))
-    with Progress(console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as bars:
+    with (
+        without_line(),
+        Progress(console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as bars,
+    ):
         task = bars.add_task("rendering", total=len(poses))
         write_fly_through(
             model, camera, poses, video, mode, report_progress=lambda done, _: bars.update(task, completed=done)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from splatbot.cli.loading import without_line
 from splatbot.cli.paths import check_output
 from splatbot.errors import InputError
 
@@ -122,7 +123,7 @@ def _progress(total: int, *, quiet: bool) -> Iterator[Callable[[int], None]]:
         from rich.progress import MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
         columns = (TextColumn("[bold]recording"), Bar(bar_width=24), MofNCompleteColumn(), TimeRemainingColumn())
-        with Progress(*columns, console=Console(stderr=True), transient=True) as bars:
+        with without_line(), Progress(*columns, console=Console(stderr=True), transient=True) as bars:
             task = bars.add_task("", total=total)
             yield lambda done: bars.update(task, completed=done)
     else:

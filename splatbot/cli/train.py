@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from splatbot.cli.loading import without_line
 from splatbot.cli.messages import set_interruption
 from splatbot.cli.paths import check_output, check_training
 from splatbot.cli.training_page import served_page, shown_on_page, viewer_port
@@ -356,7 +357,7 @@ def _progress(quiet: bool) -> Iterator[Callable[[TrainingProgress], None]]:
     from rich.progress import BarColumn, Progress, TextColumn
 
     columns = (TextColumn("[bold]{task.description}"), BarColumn(bar_width=16), TextColumn("{task.fields[numbers]}"))
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bars:
+    with without_line(), Progress(*columns, console=Console(stderr=True), transient=True) as bars:
         task = bars.add_task("reading", total=1.0, numbers="")
         yield lambda progress: bars.update(
             task,

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from splatbot.cli.drawing import CAMERA, draw_offscreen, film
+from splatbot.cli.loading import without_line
 from splatbot.cli.paths import check_file, check_output
 from splatbot.cli.placing import Pose, checked_pose, named_robot
 from splatbot.errors import FormatError, InputError
@@ -202,7 +203,7 @@ def _progress(quiet: bool) -> Iterator[Callable[[float], None] | None]:
     from rich.console import Console
     from rich.progress import Progress
 
-    with Progress(console=Console(stderr=True), transient=True) as bars:
+    with without_line(), Progress(console=Console(stderr=True), transient=True) as bars:
         task = bars.add_task("simulating", total=1.0)
         yield lambda share: bars.update(task, completed=share)
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from splatbot.cli.loading import ERASE, imports_shown
+from splatbot.cli.loading import ERASE, imports_shown, without_line
 from tests.terminal import at_a_terminal
 from tests.unit.grasping.objects import model
 
@@ -80,6 +80,17 @@ def test_a_file_and_other_threads_get_no_line() -> None:
         worker.start()
         worker.join()
     assert (file.getvalue(), terminal.getvalue()) == ("", "")
+
+
+@pytest.mark.usefixtures("slow_library")
+def test_a_live_display_keeps_its_line() -> None:
+    stream = _Terminal()
+    with imports_shown(stream):
+        with without_line():
+            importlib.import_module("slow_library")
+        assert stream.getvalue() == ""
+        importlib.import_module("other_library")
+    assert stream.getvalue().startswith(_LINE)
 
 
 def test_a_command_at_a_terminal_says_that_it_loads_before_its_first_step(tmp_path: Path) -> None:
