@@ -113,7 +113,7 @@ def plan(
         raise InputError(f"is {speed:g}.", field="--speed", hint="give a fraction of the limits, above 0, at most 1")
     file = map_file(map)
     check_file(grasp, "--grasp")
-    folder, replaced = result_folder(out, "plan", "plan.json", overwrite=overwrite)
+    folder, replaced = result_folder(out, "plan", "plan.json", "trajectory.json", overwrite=overwrite)
     named = named_robot(robot)
     for words, flag in ((start, "--start"), (goal or ("home",), "--goal")):
         joint_values(words, named, flag)
