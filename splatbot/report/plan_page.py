@@ -175,7 +175,7 @@ def plan_png(
     if nearest is not None:
         draw(sphere_parts(arm.spheres, nearest.link, arm.margin, _SHELL), shown, opacity=CONSTANTS.shell_opacity)
         view = _ringed(view, camera, T_world_camera, nearest.point)
-        least = f"ring: nearest to the map, {1e3 * nearest.clearance:.1f} mm beyond the margin"
+        least = f"ring: nearest to {nearest.obstacle}, {1e3 * nearest.clearance:.1f} mm beyond the margin"
         legend.append((f"{least}, at {nearest.time:.1f} s", _NEAREST))
         legend.append(
             (f"shell: certified spheres of the nearest link, and {1e3 * arm.margin:.1f} mm of margin", _SHELL)
