@@ -120,8 +120,8 @@ def test_it_ends_after_a_number_of_frames_or_seconds(
     three = RecordedCamera(ReplayCamera(log), tmp_path / "a.mcap", max_frames=3)
     list(three.arrivals())
     assert len(three) == len(open_log(tmp_path / "a.mcap")) == 3
-    clock = SimpleNamespace(monotonic=lambda: now[0])
     now = [100.0]
+    clock = SimpleNamespace(monotonic=lambda: now[0])
 
     class Timed(GivenFrames):
         """Each frame comes 0.05 s after the one before, on the clock of the recording."""
