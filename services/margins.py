@@ -30,11 +30,13 @@ class MarginSource:
         error: audited error of the map. If None, the margin is a number.
         margin: that number [m]; not used with an error.
         why: description for the answer.
+        required: whether the request has the margin "auto", so that its evidence must not be left out.
     """
 
     error: AuditedError | None
     margin: float
     why: str
+    required: bool = False
 
     @property
     def audited(self) -> bool:
@@ -64,7 +66,7 @@ def margin_source(served: ServedMap, given: Margin, field: GaussianCollisionFiel
         if given == "auto":
             raise
         return MarginSource(None, 0.0, f"unknown: the recording cannot be audited ({failure.message}); 0 is assumed")
-    return MarginSource(error, 0.0, "audited error of the map where the arm moves")
+    return MarginSource(error, 0.0, "audited error of the map where the arm moves", required=given == "auto")
 
 
 def plan_with_margin(

@@ -7,12 +7,13 @@ from numpy.typing import NDArray
 
 from splatbot.collision import RobotSpheres
 from splatbot.collision.unknown import UnknownPolicy
-from splatbot.errors import InputError
+from splatbot.errors import InputError, SplatbotError
 from splatbot.results.measured import surface_outside
 from splatbot.results.plan_obstacles import PlanObstacles
 from splatbot.results.unknown import unknown_in_reach
 from splatbot.robots.in_view import reopen_log
 from splatbot.robots.robot import RobotModel
+from splatbot.services.margins import MarginSource
 from splatbot.services.schemas import Pose
 from splatbot.services.store import ServedMap
 
@@ -25,7 +26,7 @@ def plan_obstacles(
     *,
     policy: UnknownPolicy = "free",
     support: bool = True,
-    measured: bool = False,
+    margin: MarginSource | None = None,
 ) -> PlanObstacles:
     """Return the obstacles of a plan: the map, its support plane, measured surface, and unknown space under a policy.
 
@@ -39,7 +40,11 @@ def plan_obstacles(
         start: (J,) configuration at which the arm is [rad or m]; the space that it fills is no obstacle.
         policy: treatment of unknown space.
         support: whether the support plane of the map's scene.yaml is an obstacle.
-        measured: whether surface that the recording of the map measured and the map lacks is an obstacle.
+        margin: of the plan. An audited one makes surface an obstacle that the recording measured and the map lacks. If
+            the recording can no longer be read and "auto" was not requested, there is no such obstacle.
+
+    Raises:
+        SplatbotError: the margin "auto" was requested, and the recording cannot be read.
     """
     arm = RobotSpheres(robot, T_world_base=T_world_base)
     known = served.workspace.support_plane if served.workspace is not None and support else None
@@ -47,12 +52,16 @@ def plan_obstacles(
     if policy != "free":
         assert run is not None  # by check_unknown
         space = served.derived.get(("unknown space", robot.name), lambda: unknown_in_reach(run, reopen_log(run), arm))
-    if measured:
+    if margin is not None and margin.audited:
         assert run is not None  # by margin_source
-        surface = served.derived.get(
-            ("measured surface", robot.name, T_world_base.tobytes()),
-            lambda: surface_outside(run, reopen_log(run), served.field, arm),
-        )
+        try:
+            surface = served.derived.get(
+                ("measured surface", robot.name, T_world_base.tobytes()),
+                lambda: surface_outside(run, reopen_log(run), served.field, arm),
+            )
+        except SplatbotError:
+            if margin.required:
+                raise
     return PlanObstacles(
         served.field,
         served.ready.model,

@@ -168,7 +168,7 @@ class OakCamera(RgbdDevice):
         model = image.getTransformation().getDistortionModel()
         coefficients = tuple(float(value) for value in image.getTransformation().getDistortionCoefficients())
         models = dai.CameraModel
-        panorama = model in (models.Equirectangular, models.Cylindrical)  # those have no coefficients
+        panorama = model.name in ("Equirectangular", "Cylindrical")  # without coefficients; depthai 3.0 has one of them
         if panorama or (any(coefficients) and model not in (models.Perspective, models.Fisheye)):
             raise self._unknown_lens(model.name, name)
         fisheye = model == models.Fisheye

@@ -88,7 +88,7 @@ class MoveItServices:
             speed = number(request, "max_velocity_scaling_factor") or DEFAULT_SPEED
             acceleration = number(request, "max_acceleration_scaling_factor") or DEFAULT_SPEED
             source = margin_source(served, None)
-            around = plan_obstacles(served, robot, base, start, measured=source.audited)
+            around = plan_obstacles(served, robot, base, start, margin=source)
 
             def search(planner: GaussianRRTStar) -> PlanResult:
                 with self._store.searches.running(planner):

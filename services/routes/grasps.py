@@ -71,10 +71,12 @@ def grasps(request: Request, served: ServedAfterFrames, service: Service, query:
     if source.error is not None:
         means = objects.scene.model.means.detach().double().numpy()
         sampler.arm_margin = source.error.in_region(means[found.rows]).quantile(MARGIN.confidence)
+    measured = False
     if not query.hand_only:
         most = max(sampler.margin, sampler.arm_margin)
-        around = plan_obstacles(served, robot, base, robot.home, policy=query.unknown, measured=source.audited)
+        around = plan_obstacles(served, robot, base, robot.home, policy=query.unknown, margin=source)
         sampler.agree_with_plans(around.field(most), around.unknown_field(most))
+        measured = around.covers_measured
     options = GraspOptions(
         friction=query.friction,
         samples=query.samples,
@@ -92,7 +94,7 @@ def grasps(request: Request, served: ServedAfterFrames, service: Service, query:
         "arm_margin_m": max(sampler.margin, sampler.arm_margin),
         "margin_source": source.why,
         "unknown_space": query.unknown,
-        "measured_surface": source.audited and not query.hand_only,
+        "measured_surface": measured,
     }
     return answer(request, summary(result) | said | {"map_version": served.map_version})
 

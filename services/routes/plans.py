@@ -85,9 +85,7 @@ def plan(request: Request, served: ServedAfterFrames, service: Service, query: _
     )
     check_unknown(served, query.unknown, query.base)
     source = margin_source(served, query.margin)
-    around = plan_obstacles(
-        served, robot, base, start, policy=query.unknown, support=query.support, measured=source.audited
-    )
+    around = plan_obstacles(served, robot, base, start, policy=query.unknown, support=query.support, margin=source)
 
     def search(planner: GaussianRRTStar) -> PlanResult:
         with service.store.searches.running(planner):

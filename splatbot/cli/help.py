@@ -52,12 +52,11 @@ def _check_numbers(documented: Callable[..., Any], words: Sequence[str]) -> None
         count, flag = _count_of(hint), f"--{name.replace('_', '-')}"
         if count == 0 or flag not in words:
             continue
-        values = list(
-            takewhile(lambda word: _is_number(word) or not word.startswith("-"), words[words.index(flag) + 1 :])
-        )
-        wrong = next((value for value in values if not _is_number(value)), None)
-        if len(values) == count and wrong is None:
+        following = words[words.index(flag) + 1 :]
+        if len(list(takewhile(_is_number, following))) == count:  # other words may follow, as the map
             continue
+        values = list(takewhile(lambda word: _is_number(word) or not word.startswith("-"), following))
+        wrong = next((value for value in values if not _is_number(value)), None)
         metavar = next((found for part in hint.__metadata__ if (found := getattr(part, "metavar", None))), "")
         examples = re.findall(rf"{flag}((?: [-+.\deE]+){{{count}}})(?= |$)", documented.__doc__ or "", re.MULTILINE)
         example = f", as in {flag}{examples[0]}" if examples else ""

@@ -95,7 +95,7 @@ class _ShowingFinder(MetaPathFinder):
         if fullname.partition(".")[0] in sys.stdlib_module_names or fullname.startswith("splatbot.cli"):
             return None
         for finder in sys.meta_path:
-            find = None if finder is self else getattr(finder, "find_spec", None)
+            find = None if isinstance(finder, _ShowingFinder) else getattr(finder, "find_spec", None)
             spec: ModuleSpec | None = None if find is None else find(fullname, path, target)
             if spec is not None:
                 if spec.loader is not None:

@@ -110,7 +110,13 @@ def modified_source_pixels(camera: Camera) -> tuple[Pixels, Pixels]:
 
     Args:
         camera: with the coefficients k1, k2, p1, p2, k3.
+
+    Raises:
+        CameraError: it has another number of coefficients.
     """
+    if len(camera.distortion) != 5:
+        hint = "record it again, or give a camera file"
+        raise CameraError(f"has {len(camera.distortion)} coefficients, not 5.", field="distortion", hint=hint)
     k1, k2, p1, p2, k3 = camera.distortion
     x = ((np.arange(camera.width) - camera.cx) / camera.fx)[None, :]
     y = ((np.arange(camera.height) - camera.cy) / camera.fy)[:, None]

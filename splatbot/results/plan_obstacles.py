@@ -138,7 +138,7 @@ class PlanObstacles:
         return self._tiles > 0
 
     def field(self, margin: float) -> GaussianCollisionField:
-        """Return the field for plans with a margin [m]; solids that the arm touches at the start are left out.
+        """Return the field for plans with a margin [m]; tiles and unknown space at the arm's start are left out.
 
         It shares the Gaussians of the map with the field of the map, and its version and gates.
         """

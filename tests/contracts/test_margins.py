@@ -13,11 +13,13 @@ import pytest
 
 from splatbot.cli import main
 from splatbot.collision import GaussianCollisionField
+from splatbot.errors import LogError
 from splatbot.gaussians import GaussianModel, Snapshot
 from splatbot.results.folder import RunFolder
 from splatbot.results.margin import audited_error
 from splatbot.robots.in_view import reopen_log
 from splatbot.robots.panda import panda
+from splatbot.services import plan_obstacles
 from splatbot.services.margins import margin_source
 from splatbot.services.settings import ServiceSettings
 from splatbot.services.store import MapStore
@@ -166,3 +168,20 @@ def test_a_plan_that_is_asked_again_states_the_same_margin(service: Service) -> 
     again = service.client.get(f"/v1/plans/{answer['id']}").json()
     assert (again["margin_m"], again["margin_source"]) == (answer["margin_m"], answer["margin_source"])
     assert np.isfinite(again["margin_m"])
+
+
+def test_a_recording_that_is_lost_after_its_audit_leaves_out_measured_surface_unless_auto_is_requested(
+    service: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert plan(service, "table").json()["covers"]["measured_surface"]  # audits the map
+
+    def gone(_: RunFolder) -> Any:
+        raise LogError("does not exist.", file="table.mcap", hint="restore it")
+
+    monkeypatch.setattr(plan_obstacles, "reopen_log", gone)
+    elsewhere = FAR | {"translation": [0.0, 31.0, 0.0]}
+    covers = plan(service, "table", base=elsewhere).json()["covers"]
+    assert (covers["margin_from"], covers["measured_surface"]) == ("audit", False)
+    refused = plan(service, "table", base=elsewhere, margin="auto")
+    assert refused.status_code == 422
+    assert "does not exist" in refused.json()["detail"]

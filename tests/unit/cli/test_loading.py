@@ -50,6 +50,12 @@ def test_an_import_shows_one_line_and_removes_it() -> None:
 
 
 @pytest.mark.usefixtures("slow_library")
+def test_a_command_in_a_command_imports_too() -> None:
+    with imports_shown(_Terminal()), imports_shown(_Terminal()):
+        assert importlib.import_module("slow_library").part.value == 3
+
+
+@pytest.mark.usefixtures("slow_library")
 def test_a_module_has_its_own_loader_afterwards() -> None:
     with imports_shown(_Terminal()):
         library = importlib.import_module("slow_library")

@@ -139,7 +139,7 @@ def test_rows_of_another_number_of_gaussians_are_refused(
 def test_grasps_have_the_ranks_of_the_table_and_of_grasp_index(
     run: RunCommand, map_file: Path, grasps: Path, tmp_path: Path
 ) -> None:
-    words = ("plan-pick", "--map", map_file, "--grasp", grasps, "--out", tmp_path / "out")
+    words = ("plan-pick", "--map", map_file, "--grasp", grasps, "--out", tmp_path / "out", "--overwrite")
     assert "grasp 0, " in run(*words).out
     assert "grasp 2, " in run(*words, "--grasp-index", 2).out
 

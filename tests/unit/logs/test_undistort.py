@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -46,6 +48,8 @@ def test_the_tangential_terms_of_librealsense_are_those_of_the_radially_distorte
         assert v[row, column] == pytest.approx(want, abs=1e-4)
     radial = Camera(120.0, 118.0, 81.0, 58.5, 160, 120, (k1, k2, 0.0, 0.0, k3))
     np.testing.assert_allclose(modified_source_pixels(radial), source_pixels(radial), atol=1e-3)
+    with pytest.raises(CameraError, match="distortion: has 4 coefficients, not 5"):
+        modified_source_pixels(replace(radial, distortion=(k1, k2, 0.0, 0.0)))
 
 
 def test_a_ray_traced_fisheye_becomes_the_ray_traced_pinhole_and_no_depth_is_between_two_surfaces() -> None:

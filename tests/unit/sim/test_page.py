@@ -136,7 +136,7 @@ def test_the_page_names_all_that_it_draws_and_fits_a_phone(browser: str, tmp_pat
     page = twin_html(*recorded())
     rows = re.findall(r"<li><i [^>]*></i>([^<]*)</li>", page)
     assert rows[0].startswith("arm and hand")
-    assert {"path of the tool", "mug", "clearance of the arm"} < set(rows)
+    assert {"path of the tool", "mug", "clearance of arm and hand, in the curve"} < set(rows)
     with Chromium(tmp_path / "profile", width=360, height=640) as chromium:
         (tmp_path / "run.html").write_text(page)
         for scheme, page_color in (("light", "rgb(238, 240, 243)"), ("dark", "rgb(22, 24, 29)")):

@@ -125,7 +125,7 @@ class SoftwareStreams:
         for sensor, profile, _ in self._profiles:
             sensor.open(profile)
             sensor.start(self._pairs)
-        threading.Thread(target=self._send, daemon=True).start()
+        self._sender = threading.Thread(target=self._send, daemon=True)
 
     def _send(self) -> None:
         for number, images in enumerate(self._images, 1):
@@ -147,6 +147,8 @@ class SoftwareStreams:
             time.sleep(0.0301)
 
     def wait(self, milliseconds: int) -> Any:
+        if not self._sender.ident:  # the driver has opened all streams: none misses the first samples
+            self._sender.start()
         came, pair = self._pairs.try_wait_for_frames(milliseconds)
         return pair if came and pair.get_color_frame() and pair.get_depth_frame() else None
 
