@@ -156,7 +156,7 @@ def test_views_of_several_cameras_come_in_one_answer(api: Service, robot: Client
 def test_a_plan_is_followed_watched_and_ends_where_it_should(api: Service, robot: Client) -> None:
     at = api.client.get("/v1/arms/twin").json()["position"]
     goal = [at[0] + 0.2, *at[1:]]
-    plan = robot.plan("lab", start=at, goal=goal, budget_ms=50)
+    plan = robot.plan("lab", start=at, goal=goal, budget_ms=500)
     assert plan["certified"]
     lease = robot.lease("twin", preempt=True)
     motion = lease.send(plan["id"], key="once")

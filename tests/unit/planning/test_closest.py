@@ -24,7 +24,7 @@ MARGIN = 0.004
 def planned() -> tuple[RobotSpheres, GaussianCollisionField, JointTrajectory]:
     field = GaussianCollisionField(tabletop().gaussians(4000), 2.0)
     planner = GaussianRRTStar(field, panda(), T_world_base=T_WORLD_BASE, margin=MARGIN)
-    path = planner.plan(panda().home, GOAL, budget_ms=50).unwrap()
+    path = planner.plan(panda().home, GOAL, budget_ms=60_000, iterations=200).unwrap()
     return planner.arm, field, time_path(path, planner.arm, field)
 
 

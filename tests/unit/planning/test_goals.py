@@ -23,16 +23,16 @@ def planner() -> GaussianRRTStar:
 
 def test_a_pose_is_reached_exactly_in_one_of_its_postures(planner: GaussianRRTStar) -> None:
     T = panda().tcp(RIGHT)
-    path = planner.plan(LEFT, PoseGoal(T), budget_ms=300).unwrap()
+    path = planner.plan(LEFT, PoseGoal(T), budget_ms=60_000, iterations=1000).unwrap()
     reached = panda().tcp(path.waypoints[-1])
     np.testing.assert_allclose(reached, T, atol=2e-6)
-    assert path.cost <= planner.plan(LEFT, JointGoal(RIGHT), budget_ms=300).unwrap().cost * 1.5
+    assert path.cost <= planner.plan(LEFT, JointGoal(RIGHT), budget_ms=60_000, iterations=1000).unwrap().cost * 1.5
 
 
 def test_the_end_of_a_path_to_a_region_lies_in_it(planner: GaussianRRTStar) -> None:
     T = panda().tcp(RIGHT)
     box, turn = np.array([0.05, 0.03, 0.0]), np.array([0.0, 0.0, np.pi])
-    path = planner.plan(LEFT, PoseGoal(T, position=box, angle=turn), budget_ms=300).unwrap()
+    path = planner.plan(LEFT, PoseGoal(T, position=box, angle=turn), budget_ms=60_000, iterations=1000).unwrap()
     off = np.linalg.inv(T) @ panda().tcp(path.waypoints[-1])
     assert (np.abs(off[:3, 3]) <= box + 2e-6).all()
     assert (np.abs(so3_log(off[:3, :3])) <= turn + 2e-6).all()
@@ -44,7 +44,7 @@ def test_the_base_may_stand_anywhere() -> None:
     far.means += 50.0
     planner = GaussianRRTStar(GaussianCollisionField(far), panda(), T_world_base=T_world_base)
     T = T_world_base @ panda().tcp(RIGHT)
-    path = planner.plan(LEFT, PoseGoal(T), budget_ms=300).unwrap()
+    path = planner.plan(LEFT, PoseGoal(T), budget_ms=60_000, iterations=1000).unwrap()
     np.testing.assert_allclose(T_world_base @ panda().tcp(path.waypoints[-1]), T, atol=2e-6)
 
 
@@ -55,7 +55,7 @@ def test_a_pose_behind_a_full_turn_is_reached_the_short_way() -> None:
     planner = GaussianRRTStar(GaussianCollisionField(far), robot)
     goal = robot.home + 0.2
     for seed in range(5):
-        path = planner.plan(robot.home, PoseGoal(robot.tcp(goal)), budget_ms=50, seed=seed).unwrap()
+        path = planner.plan(robot.home, PoseGoal(robot.tcp(goal)), budget_ms=60_000, iterations=200, seed=seed).unwrap()
         assert (np.abs(path.waypoints[-1] - robot.home) <= np.pi + 1e-9).all()
         assert path.cost < 1.0
 
