@@ -1,5 +1,7 @@
 """Measure how near certified paths pass measured points: `python -m experiments.measured_clearance RUN ...`.
 
+`--other-frames` takes the points of frames that neither the audit nor the search for measured surface used.
+
 The paths are those of `splatbot plan` in a run folder with its defaults. The margin is the audited error of the region
 of each motion, and the support plane is an obstacle. The audit samples 5,000 pixels of a frame; here all pixels of the
 same frames propose points. A point counts if another frame measures the same depth there. The script needs no truth.
@@ -105,8 +107,11 @@ class PathClearance:
     outside: float
 
 
-def open_scene(run: Path) -> MappedScene:
-    """Open a run, place the arm as `splatbot bench planning --run` does, and find the measured points in its reach."""
+def open_scene(run: Path, *, other_frames: bool = False) -> MappedScene:
+    """Open a run, place the arm as `splatbot bench planning --run` does, and find the measured points in its reach.
+
+    With ``other_frames`` the points are those of frames that plans do not use.
+    """
     folder = RunFolder(run)
     model = GaussianModel.load(run / "map.ply")
     field = GaussianCollisionField(model, _PLAN["n_sigma"], min_observations=_PLAN["min_observations"])
@@ -116,8 +121,11 @@ def open_scene(run: Path) -> MappedScene:
         raise InputError("is not known.", file=run / "scene.yaml", field="T_world_base, workspace", hint=hint)
     log, sensor, robot = reopen_log(folder), folder.load_config().sensor, panda()
     reach, base = robot.chain.reach(robot.T_link_tcp), place.T_world_base[:3, 3]
+    used, views = raw_views(folder, log)
+    if other_frames:
+        _, views = raw_views(folder, log, without=used)
     points = confirmed_near(
-        raw_views(folder, log)[1],
+        views,
         base - reach,
         base + reach,
         floor=sensor.sigma_depth_floor,
@@ -234,10 +242,12 @@ def _share(chosen: NDArray[np.bool_]) -> str:
 
 def main(argv: Sequence[str]) -> None:
     """Print the counts of each run."""
-    if not argv:
-        raise SystemExit("give run folders of splatbot map: python -m experiments.measured_clearance RUN ...")
-    for name in argv:
-        scene = open_scene(Path(name))
+    other = "--other-frames" in argv
+    names = [word for word in argv if word != "--other-frames"]
+    if not names:
+        raise SystemExit("give run folders: python -m experiments.measured_clearance [--other-frames] RUN ...")
+    for name in names:
+        scene = open_scene(Path(name), other_frames=other)
         print(f"{name}: {len(scene.points):,} points that two frames measure", flush=True)
         found, tried = measure(scene, CONSTANTS.paths)
         if not found:
