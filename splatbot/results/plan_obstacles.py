@@ -192,7 +192,7 @@ class PlanObstacles:
         hints = {
             "unknown space": "map the place from more views, give another goal, or let unknown space be free",
             "the support plane": "give another goal, correct the plane in scene.yaml, or leave it out (`--no-support`)",
-            "measured surface": "map again with the mask of the robot, or give the margin in metres, without them",
+            "measured surface": "map again with the robot masked, or give the margin in metres, which ignores it",
         }
         raise UnmappedObstacleError(f"{cause.deep_in(meanings[kind])}.", field=ends[result.status], hint=hints[kind])
 
