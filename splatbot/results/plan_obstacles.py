@@ -124,7 +124,7 @@ class PlanObstacles:
 
     @property
     def solids(self) -> GaussianModel:
-        """Return the obstacles of the latest field that are not in the map, as Gaussians."""
+        """Return support plane and unknown space of the latest field as Gaussians: obstacles where the map is empty."""
         return self._solids
 
     @property
@@ -146,8 +146,9 @@ class PlanObstacles:
         if self._plane is not None:
             tiles = support_tiles(self._plane, self._arm, self._start, margin=margin, n_sigma=self._field.n_sigma)
         self._tiles = len(tiles)
-        solids = GaussianModel.concatenate([tiles, self._measured, self._unknown(margin)])
-        self._solids = solids
+        unknown = self._unknown(margin)
+        self._solids = GaussianModel.concatenate([tiles, unknown])
+        solids = GaussianModel.concatenate([tiles, self._measured, unknown])
         if not len(solids):
             return self._field
         # No gate on observations removes a solid.

@@ -114,6 +114,9 @@ def test_kinds_of_obstacles_are_told_apart_in_a_map_with_harmonics() -> None:
     assert {around.kind(len(rich) + k) for k in (0, tiles - 1)} == {"the support plane"}
     assert {around.kind(len(rich) + tiles + k) for k in (0, 1)} == {"measured surface"}
     assert {around.kind(len(rich) + tiles + k) for k in (2, 3)} == {"unknown space"}
+    drawn = around.solids.means.numpy()
+    assert len(drawn) > tiles
+    assert np.linalg.norm(drawn - [1.0, 2.0, 3.0], axis=1).min() > 0.1  # the map shows the surface that was measured
     plain = PlanObstacles(GaussianCollisionField(rich), rich, arm, robot.home)
     assert len(plain.field(MARGIN)) == len(rich)
     assert CONSTANTS.radius > CONSTANTS.spacing / np.sqrt(2)
