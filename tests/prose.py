@@ -58,7 +58,13 @@ BANNED = {
     r"word on|a word of|in a word": "message",
     r"puts? (?:it|them) (?:down|right)": "plain English",
 }
-_CONSTRUCTIONS = [(re.compile(rf"(?<![\w-])(?:{pattern})(?!\w)", re.I), fix) for pattern, fix in BANNED.items()]
+
+
+def _whole_words(pattern: str) -> re.Pattern[str]:
+    """Compile a pattern that matches only whole words."""
+    return re.compile(rf"(?<![\w-])(?:{pattern})(?!\w)", re.I)
+
+
 _STARTS = re.compile(r"^(Of|Nor|Whether|As for|Or|Lest|For (?:it|they|there|no|what|a|the))\b")
 
 _CODE = re.compile(r"``[^`]*``|:\w+:`[^`]*`|`[^`]*`")
@@ -81,20 +87,29 @@ class Finding:
 
 
 @cache
-def glossary() -> tuple[tuple[re.Pattern[str], str], ...]:
-    """Return the words that docs/glossary.md replaces, each as a pattern with its term.
+def _replacements() -> tuple[tuple[str, str], ...]:
+    """Return each construction of ``BANNED`` and each word that docs/glossary.md replaces, with its replacement.
 
     The glossary is a table ``| term | meaning | instead of |``; the third column holds comma-separated words.
     """
-    path, rows = ROOT / "docs" / "glossary.md", []
-    if not path.exists():
-        return ()
+    path, rows = ROOT / "docs" / "glossary.md", list(BANNED.items())
     for line in path.read_text(encoding="utf-8").splitlines():
         cells = [cell.strip() for cell in line.strip().strip("|").split("|")]
         if line.startswith("|") and len(cells) == 3 and not set(cells[2]) <= set("- :") and cells[2] != "instead of":
             for word in filter(None, (w.strip().strip("`") for w in cells[2].split(","))):
-                rows.append((re.compile(rf"(?<![\w-]){re.escape(word)}(?!\w)", re.I), cells[0].strip("`*")))
+                rows.append((re.escape(word), cells[0].strip("`*")))
     return tuple(rows)
+
+
+@cache
+def _anything_to_replace() -> re.Pattern[str]:
+    """Return one pattern that matches where a banned construction or a word of the glossary does."""
+    return _whole_words("|".join(f"(?:{words})" for words, _ in _replacements()))
+
+
+@cache
+def _constructions() -> tuple[tuple[re.Pattern[str], str], ...]:
+    return tuple((_whole_words(words), replacement) for words, replacement in _replacements())
 
 
 def sentences(text: str) -> list[str]:
@@ -119,7 +134,9 @@ def check(path: Path, line: int, text: str, *, lengths: bool = True) -> Iterator
             yield Finding(path, line, f"{words(sentence)} words, at most {MAX_WORDS}", sentence)
         if _STARTS.search(sentence):
             yield Finding(path, line, "verbless or inverted", sentence)
-        for pattern, fix in (*_CONSTRUCTIONS, *glossary()):
+        if not _anything_to_replace().search(sentence):
+            continue
+        for pattern, fix in _constructions():
             hit = pattern.search(sentence)
             if hit:
                 yield Finding(path, line, f"'{hit.group()}' (use: {fix})", sentence)
@@ -169,9 +186,9 @@ def _docstring_parts(doc: str) -> Iterator[tuple[int, str]]:
 def python(path: Path) -> Iterator[Finding]:
     """Check docstrings, comments and messages of a Python file."""
     source = path.read_text(encoding="utf-8")
-    tree = ast.parse(source)
+    nodes = list(ast.walk(ast.parse(source)))
     documented: set[int] = set()
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
             first = node.body[0] if node.body else None
             if (
@@ -184,13 +201,13 @@ def python(path: Path) -> Iterator[Finding]:
                 for offset, text in _docstring_parts(doc):
                     yield from check(path, first.lineno + offset, text)
                 yield from _first_word(path, node, first.lineno, doc)
-    for node in ast.walk(tree):
+    for node in nodes:
         literal = node.value if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) else None
         if literal is not None and isinstance(literal.value, str) and id(literal) not in documented:
             yield from check(path, literal.lineno, literal.value)
             documented.add(id(literal))
     if "tests" not in path.relative_to(ROOT).parts:
-        yield from _messages(path, tree, documented)
+        yield from _messages(path, nodes, documented)
     yield from _comments(path, source)
 
 
@@ -210,10 +227,10 @@ def _first_word(path: Path, node: ast.AST, line: int, doc: str) -> Iterator[Find
         )
 
 
-def _messages(path: Path, tree: ast.AST, documented: set[int]) -> Iterator[Finding]:
+def _messages(path: Path, nodes: Sequence[ast.AST], documented: set[int]) -> Iterator[Finding]:
     """Check string literals that read as prose: four words or more."""
-    inside = {id(part) for node in ast.walk(tree) if isinstance(node, ast.JoinedStr) for part in ast.walk(node)}
-    for node in ast.walk(tree):
+    inside = {id(part) for node in nodes if isinstance(node, ast.JoinedStr) for part in ast.walk(node)}
+    for node in nodes:
         text = None
         if isinstance(node, ast.JoinedStr):
             text = "".join(str(v.value) if isinstance(v, ast.Constant) else "X" for v in node.values)
