@@ -62,6 +62,8 @@ def signed_distances(v: Array, a: Array) -> Array:
     high = np.maximum(np.linalg.norm((a * v).astype(np.float64), axis=-1).astype(np.longdouble), low)
     for _ in range(200):
         middle = (low + high) / 2
+        if not ((low < middle) & (middle < high)).any():  # no number lies between
+            break
         outside = ((a * v / (D + middle[..., None])) ** 2).sum(axis=-1) > 1
         low, high = np.where(outside, middle, low), np.where(outside, high, middle)
     s = (low + high)[..., None] / 2

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import cache
 
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 
 from splatbot._native import available_isas, set_isa
 from splatbot.collision import GaussianCollisionField
 from splatbot.errors import InputError
+from splatbot.gaussians import GaussianModel
 from tests.unit.collision.oracle import Array, gaussians, local, random_gaussians, separation, signed_distances
 
 UNDER, ROUNDED_UP = 4e-6, 1e-6  # of ClearanceResult: times |v|_1 + a, times the longest semi-axis
@@ -71,20 +74,27 @@ def test_spheres_and_balls_of_radius_zero_have_the_closed_form() -> None:
     np.testing.assert_array_equal(np.asarray(answer), answer.distance)
 
 
-def test_hits_equal_splat_navs_separation_and_are_never_unsafe(isa: str) -> None:
+@cache
+def _pairs() -> tuple[tuple[GaussianModel, Array, NDArray[np.bool_], Array], ...]:
+    """Return 40 ellipsoids, each with spheres (2500, 4), whether they are apart, and their gaps [m]."""
     rng = np.random.default_rng(1)
-    n = 100_000
     scales = np.exp(rng.uniform(np.log(1e-3), np.log(0.1), (40, 3)))
     model = gaussians(np.zeros((40, 3)), scales, rng.normal(size=(40, 4)))
-    unsafe = missed = 0
-    for i in range(40):  # one ellipsoid a field: every pair is decided by itself
+    pairs = []
+    for i in range(40):
         one = model.select(torch.tensor([i]))
-        points = rng.normal(size=(n // 40, 3)) * scales[i].max() * 2.5
-        radii = rng.uniform(0, 0.1, n // 40)
-        hit = GaussianCollisionField(one).in_collision(np.c_[points, radii])
+        points = rng.normal(size=(2500, 3)) * scales[i].max() * 2.5
+        radii = rng.uniform(0, 0.1, 2500)
         v, a = (x[..., 0, :] for x in np.broadcast_arrays(*local(one, 2.0, points)))
         apart = separation(v, a, np.maximum(radii, 1e-9)) > 1
-        gap = signed_distances(v, a) - radii
+        pairs.append((one, np.c_[points, radii], apart, signed_distances(v, a) - radii))
+    return tuple(pairs)
+
+
+def test_hits_equal_splat_navs_separation_and_are_never_unsafe(isa: str) -> None:
+    unsafe = missed = 0
+    for one, spheres, apart, gap in _pairs():  # one ellipsoid a field: every pair is decided by itself
+        hit = GaussianCollisionField(one).in_collision(spheres)
         unsafe += int((~hit & ~apart).sum())
         missed += int((hit & apart & (gap > 1e-5)).sum())
     assert unsafe == 0
@@ -165,8 +175,6 @@ def test_beyond_the_cut_there_is_no_answer_and_within_it_the_same() -> None:
 
 
 def test_an_empty_map_is_free_everywhere() -> None:
-    from splatbot.gaussians import GaussianModel
-
     field = GaussianCollisionField(GaussianModel.empty())
     assert not field.in_collision([[0.0, 0, 0, 10.0]]).any()
     assert field.clearance([[0.0, 0, 0]]).distance[0] == np.inf
