@@ -47,11 +47,13 @@ class FakeLine(ABC):
     Attributes:
         port: path of the pseudo-terminal.
         requests: complete requests to this device.
+        silences: number of silent periods; after two of them, all earlier requests are answered or discarded.
     """
 
     def __init__(self, faults: LineFaults | None, *, seed: int) -> None:
         self.faults = faults if faults is not None else LineFaults()
         self.requests: list[bytes] = []
+        self.silences = 0
         self._rng = np.random.default_rng(seed)
         self._master, self._slave = pty.openpty()
         tty.setraw(self._slave)
@@ -88,6 +90,7 @@ class FakeLine(ABC):
             ready, _, _ = select.select([self._master], [], [], QUIET)
             if not ready:
                 data = b""  # silence ends a frame, whole or not
+                self.silences += 1
                 continue
             data += self._through(os.read(self._master, 256))
             if len(data) >= self._length(data):

@@ -17,6 +17,7 @@ from splatbot.errors import GripperError, InputError
 from splatbot.protocols import Gripper
 from splatbot.robots.grippers import FakeFeetech, FeetechGripper, JawCalibration, LineFaults
 from splatbot.robots.grippers.errors import FaultError, LineError, NoAnswerError
+from tests.devices.lines import emulate_timeouts, wait_for_rest
 from tests.waiting import until
 
 JAW = JawCalibration(closed=2030, opened=3330, stroke=0.10, force=20.0)
@@ -39,8 +40,9 @@ def gripper(device: FakeFeetech) -> Iterator[FeetechGripper]:
 
 
 @pytest.fixture
-def hasty(device: FakeFeetech) -> Iterator[FeetechGripper]:
+def hasty(device: FakeFeetech, monkeypatch: pytest.MonkeyPatch) -> Iterator[FeetechGripper]:
     """A driver that waits briefly, for lines without good answers."""
+    emulate_timeouts(monkeypatch, device)
     with FeetechGripper(device.port, JAW, timeout=0.03) as one:
         one.activate()
         yield one
@@ -103,14 +105,14 @@ def test_a_stop_from_another_thread_keeps_the_present_position(gripper: FeetechG
 
 def test_an_activation_moves_nothing_and_drops_nothing(device: FakeFeetech) -> None:
     device.width = 0.05
-    with FeetechGripper(device.port, JAW) as first:
+    with FeetechGripper(device.port, JAW, timeout=5.0) as first:
         with pytest.raises(GripperError, match="not activated"):
             first.move(0.01)
         first.activate()
         assert device.commanded.goal == JAW.opened
         first.move(0.0)
         first.wait()
-    with FeetechGripper(device.port, JAW) as second:
+    with FeetechGripper(device.port, JAW, timeout=5.0) as second:
         writes = sum(request[4] == 3 for request in device.requests)
         second.activate()
         assert sum(request[4] == 3 for request in device.requests) == writes
@@ -184,14 +186,15 @@ def test_a_servo_that_lost_its_command_is_an_error_and_not_at_its_goal(
 @pytest.mark.parametrize(("address", "value", "text"), [(3, 4, "model 772"), (33, 1, "operating mode 1")])
 def test_another_servo_or_mode_is_refused(device: FakeFeetech, address: int, value: int, text: str) -> None:
     device.memory[address] = value
-    with FeetechGripper(device.port, JAW) as gripper, pytest.raises(GripperError, match=text):
+    with FeetechGripper(device.port, JAW, timeout=5.0) as gripper, pytest.raises(GripperError, match=text):
         gripper.activate()
     assert all(request[4] == 2 for request in device.requests)  # nothing was written
 
 
 def test_a_thousand_commands_on_a_line_that_loses_bytes_end_done_or_as_an_error(
-    device: FakeFeetech, caplog: pytest.LogCaptureFixture
+    device: FakeFeetech, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    emulate_timeouts(monkeypatch, device)
     rng = np.random.default_rng(5)
     with FeetechGripper(device.port, JAW, timeout=0.008, retries=2) as gripper:
         gripper.activate()
@@ -240,7 +243,7 @@ def test_a_line_that_never_gives_a_good_answer_is_a_typed_error_after_bounded_tr
     with pytest.raises(NoAnswerError, match="no good answer to 5 tries"):
         hasty.move(0.01)
     device.faults = LineFaults()
-    time.sleep(0.3 if faults.delay else 0.0)
+    wait_for_rest(device)
     with pytest.raises(GripperError, match="takes no move"):
         hasty.move(0.02)
     hasty.activate()

@@ -16,6 +16,7 @@ from splatbot.protocols import Gripper
 from splatbot.robots.grippers import FakeRobotiq, LineFaults, RobotiqGripper
 from splatbot.robots.grippers.errors import FaultError, LineError, NoAnswerError, RefusedError
 from splatbot.robots.grippers.registers import Fingers
+from tests.devices.lines import emulate_timeouts, wait_for_rest
 
 HURRY = 20.0
 
@@ -35,8 +36,9 @@ def gripper(device: FakeRobotiq) -> Iterator[RobotiqGripper]:
 
 
 @pytest.fixture
-def hasty(device: FakeRobotiq) -> Iterator[RobotiqGripper]:
+def hasty(device: FakeRobotiq, monkeypatch: pytest.MonkeyPatch) -> Iterator[RobotiqGripper]:
     """A driver that waits briefly, for lines without good answers."""
+    emulate_timeouts(monkeypatch, device)
     with RobotiqGripper(device.port, timeout=0.03) as one:
         one.activate()
         yield one
@@ -91,13 +93,13 @@ def test_a_stop_from_another_thread_ends_a_slow_move_at_once(gripper: RobotiqGri
 
 def test_no_move_before_it_is_activated_and_no_second_activation_drops_what_it_holds(device: FakeRobotiq) -> None:
     device.width = 0.05
-    with RobotiqGripper(device.port) as first:
+    with RobotiqGripper(device.port, timeout=5.0) as first:
         with pytest.raises(GripperError, match="not activated"):
             first.move(0.01)
         first.activate()
         first.move(0.0)
         first.wait()
-    with RobotiqGripper(device.port) as second:
+    with RobotiqGripper(device.port, timeout=5.0) as second:
         asked = len(device.requests)
         second.activate()
         assert len(device.requests) == asked + 1  # one question, no command
@@ -152,8 +154,9 @@ def test_calibration_takes_the_grippers_own_ends(gripper: RobotiqGripper, device
 
 
 def test_a_thousand_commands_on_a_line_that_loses_bytes_end_done_or_as_an_error_and_at_rest(
-    device: FakeRobotiq, caplog: pytest.LogCaptureFixture
+    device: FakeRobotiq, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    emulate_timeouts(monkeypatch, device)
     rng = np.random.default_rng(5)
     with RobotiqGripper(device.port, timeout=0.008, retries=2) as gripper:
         gripper.activate()
@@ -203,7 +206,7 @@ def test_a_line_that_never_gives_a_good_answer_is_a_typed_error_after_bounded_tr
         hasty.move(0.01)
     assert hasty.unsafe
     device.faults = LineFaults()
-    time.sleep(0.3 if faults.delay else 0.0)
+    wait_for_rest(device)
     with pytest.raises(GripperError, match="takes no move"):
         hasty.move(0.02)
     hasty.activate()
@@ -253,7 +256,7 @@ def test_fingers_that_never_arrive_are_told_to_stand_still(gripper: RobotiqGripp
 
 
 def test_the_larger_model_has_its_own_stroke() -> None:
-    with FakeRobotiq("2f-140", hurry=HURRY) as device, RobotiqGripper(device.port, "2f-140") as gripper:
+    with FakeRobotiq("2f-140", hurry=HURRY) as device, RobotiqGripper(device.port, "2f-140", timeout=5.0) as gripper:
         gripper.activate()
         gripper.move(0.12)
         gripper.wait()

@@ -287,12 +287,12 @@ def test_a_stop_request_stops_the_pick_and_is_reported(after: int) -> None:
 
 
 def test_with_a_gripper_on_a_serial_port() -> None:
-    with FakeRobotiq(width=0.06, hurry=20.0) as device, RobotiqGripper(device.port, timeout=0.1) as gripper:
+    with FakeRobotiq(width=0.06, hurry=20.0) as device, RobotiqGripper(device.port, timeout=5.0) as gripper:
         gripper.activate()
         result = with_fake(gripper)
         assert result, result.reason
         assert result.opening == pytest.approx(0.06, abs=1e-3)
-    with FakeRobotiq(width=0.06, hurry=20.0) as device, RobotiqGripper(device.port, timeout=0.1) as gripper:
+    with FakeRobotiq(width=0.06, hurry=20.0) as device, RobotiqGripper(device.port, timeout=5.0) as gripper:
         gripper.activate()
         device.fault = 0x0E
         result = with_fake(gripper)
