@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from itertools import islice
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -152,6 +153,8 @@ def test_a_silent_device_is_gone_and_lost_images_are_counted(
     for part in ("_color", "_depth"):
         setattr(streams, part, [p for p in getattr(streams, part) if p.sequence not in (2, 3)])
     camera = OakCamera(streams=streams)
+    after_lost = SimpleNamespace(monotonic=lambda: time.monotonic() if camera.dropped else 0.0)
+    monkeypatch.setattr(device, "time", after_lost)  # the silence begins after the images that follow the lost ones
     with pytest.raises(DeviceError, match="is gone"):
         list(camera)
     assert camera.dropped == 2

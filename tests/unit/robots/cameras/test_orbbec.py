@@ -404,6 +404,8 @@ def test_lost_images_are_counted_and_a_silent_device_is_gone(monkeypatch: pytest
     monkeypatch.setattr(device, "CONSTANTS", device.RgbdDeviceConstants(silence_s=0.1, poll_s=0.01))
     library = use(monkeypatch, Library([images(0), None, FrameSet(None, None), images(4)]))
     camera = OrbbecCamera()
+    after_lost = SimpleNamespace(monotonic=lambda: time.monotonic() if camera.dropped else 0.0)
+    monkeypatch.setattr(device, "time", after_lost)  # the silence begins after the images that follow the lost ones
     with pytest.raises(DeviceError, match="is gone"):
         list(camera)
     assert camera.dropped == 3

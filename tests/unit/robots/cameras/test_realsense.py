@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import islice, pairwise
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -364,6 +365,8 @@ def test_samples_of_another_clock_than_the_images_are_left_out_with_a_warning(
 def test_lost_images_are_counted_and_a_silent_device_is_gone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(device, "CONSTANTS", device.RgbdDeviceConstants(silence_s=0.5))
     camera = opened(lambda: SoftwareStreams(scene(8), missing=(4, 5)))
+    after_lost = SimpleNamespace(monotonic=lambda: time.monotonic() if camera.dropped else 0.0)
+    monkeypatch.setattr(device, "time", after_lost)  # the silence begins after the images that follow the lost ones
     with pytest.raises(DeviceError, match="is gone"):
         list(camera)
     assert camera.dropped == 2
