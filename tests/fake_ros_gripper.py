@@ -89,6 +89,7 @@ class FakeRosGripper(FakeRosbridge):
         self.cancels, self.stalled = 0, False
         self.last: tuple[str, ServerConnection] | None = None
         self._goal: HandGoal | None = None
+        self._moved_at = time.monotonic()
         super().__init__(_PERIOD_S)
 
     def repeat_result(self, name: str, status: int) -> None:
@@ -141,8 +142,8 @@ class FakeRosGripper(FakeRosbridge):
                 self._end(self._goal, _CANCELED)
 
     def _tick(self, ticks: int) -> None:
-        faults = self.behaviour
-        step = faults.speed * self._period
+        faults, now = self.behaviour, time.monotonic()
+        step, self._moved_at = faults.speed * (now - self._moved_at), now
         moved = self.finger + float(np.clip(self.target - self.finger, -step, step))
         blocked = faults.width > 0.0 and moved <= faults.width / 2 and self.target < faults.width / 2
         self.finger = faults.width / 2 if blocked else moved

@@ -14,7 +14,8 @@ import numpy as np
 from splatbot.protocols import Array
 
 _WINDOW_S = 0.3  # [s] states that decide whether the arm rests
-_LEAST_S = 0.1  # [s] they must span
+_LEAST_S = 0.1  # [s] they must span, by their stamps and by their arrivals
+_MOST = 2000  # states that are kept, however slowly the clock of a simulated robot runs
 _STILL = 1e-3  # [rad or m] largest motion of an arm at rest within them
 
 
@@ -38,7 +39,7 @@ class ArmStates:
 
     def __init__(self, names: Sequence[str]) -> None:
         self._names = tuple(names)
-        self._samples: deque[_Sample] = deque()
+        self._samples: deque[_Sample] = deque(maxlen=_MOST)
         self._restarted = False
         self._lock = threading.Lock()
 
@@ -71,7 +72,7 @@ class ArmStates:
                 return
             self._restarted = False
             self._samples.append(_Sample(now, stamp, position, velocity))
-            while self._samples[0].arrived < now - _WINDOW_S and len(self._samples) > 2:
+            while len(self._samples) > 2 and _span(self._samples[0], self._samples[-1]) > _WINDOW_S:
                 self._samples.popleft()
 
     @property
@@ -82,10 +83,10 @@ class ArmStates:
 
     @property
     def rests(self) -> bool:
-        """True if the arm did not move in the last states."""
+        """True if the arm did not move in the last states, whose time counts by stamps, too: they may arrive late."""
         with self._lock:
             samples = list(self._samples)
-        if not samples or samples[-1].arrived - samples[0].arrived < _LEAST_S:
+        if not samples or _span(samples[0], samples[-1]) < _LEAST_S:
             return False
         return bool(np.ptp([sample.position for sample in samples], axis=0).max() <= _STILL)
 
@@ -99,6 +100,11 @@ class ArmStates:
         if last.velocity is not None or last is first:
             return last.position, np.zeros_like(last.position) if last.velocity is None else last.velocity
         return last.position, (last.position - first.position) / (1e-9 * (last.stamp - first.stamp))
+
+
+def _span(first: _Sample, last: _Sample) -> float:
+    """Return the time [s] from one state to another, by the clock on which less has passed."""
+    return min(last.arrived - first.arrived, 1e-9 * (last.stamp - first.stamp))
 
 
 def nanoseconds(stamp: Mapping[str, Any]) -> int:

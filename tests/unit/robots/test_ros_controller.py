@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -388,6 +389,38 @@ def test_states_of_another_clock_count_after_a_lost_connection_alone() -> None:
     assert position() == [0.0, 2.0]
     states.take(state(4, 3.0))
     assert position() == [0.0, 2.0]
+
+
+def _rest_after(monkeypatch: pytest.MonkeyPatch, states: list[tuple[float, float, float]]) -> list[bool]:
+    """Return whether a joint rests after each state, given as time of arrival [s], stamp [s] and position [rad]."""
+    now, known, found = [0.0], ArmStates(("a",)), []
+    monkeypatch.setattr("splatbot.robots.controllers.arm_states.time", SimpleNamespace(monotonic=lambda: now[0]))
+    for now[0], stamp, q in states:
+        sec, nanosec = divmod(round(stamp * 1e9), 10**9)
+        known.take({"header": {"stamp": {"sec": sec, "nanosec": nanosec}}, "name": ["a"], "position": [q]})
+        found.append(known.rests)
+    return found
+
+
+def test_states_that_arrive_late_do_not_show_a_moving_joint_at_rest(monkeypatch: pytest.MonkeyPatch) -> None:
+    speed = 0.02  # [rad/s]; 0.3 mrad from one state to the next
+    moving = [(10.0 + 0.016 * k, 5.0 + 0.016 * k, speed * 0.016 * k) for k in range(20)]
+    assert not any(_rest_after(monkeypatch, moving))
+    late = [(at + (0.2 if k else 0.0), stamp, q) for k, (at, stamp, q) in enumerate(moving)]
+    assert not any(_rest_after(monkeypatch, late))
+    at_once = [(10.5 + 1e-3 * k, stamp, 0.0) for k, (_, stamp, _) in enumerate(moving)]
+    assert not any(_rest_after(monkeypatch, at_once))  # they may all be old
+
+
+@pytest.mark.parametrize("pace", [1.0, 0.05])
+def test_a_joint_rests_once_it_stood_for_the_window_of_a_clock_however_slowly_that_runs(
+    pace: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    step, stop = 0.016, 10  # [s] of the robot's clock between two states, and the first state at the end
+    states = [(step / pace * k, 3.0 + step * k, 0.01 * min(k, stop)) for k in range(40)]
+    found = _rest_after(monkeypatch, states)
+    first = stop + int(0.3 / step)
+    assert found == [False] * first + [True] * (40 - first)
 
 
 def test_a_pick_is_executed_goal_by_goal() -> None:
