@@ -9,7 +9,7 @@ import json
 import struct
 import time
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import cv2
@@ -187,13 +187,13 @@ def png(width: int, height: int) -> bytes:
     return bytes(data)
 
 
-PICTURES = {
-    "a TIFF of 9000 x 9000": tiff(9000, 9000),
-    "a JPEG of 30,000 x 30,000": jpeg(30_000, 30_000),
-    "a JPEG with its size behind 1 MB": jpeg(30_000, 30_000, 1 << 20),
-    "a PNG of 30,000 x 30,000": png(30_000, 30_000),
-    "a JPEG that never says": b"\xff\xd8\xff" + b"\xff" * 2_000_000,
-    "a BMP": cv2.imencode(".bmp", np.zeros((4, 4, 3), np.uint8))[1].tobytes(),
+PICTURES: dict[str, Callable[[], bytes]] = {
+    "a TIFF of 9000 x 9000": lambda: tiff(9000, 9000),
+    "a JPEG of 30,000 x 30,000": lambda: jpeg(30_000, 30_000),
+    "a JPEG with its size behind 1 MB": lambda: jpeg(30_000, 30_000, 1 << 20),
+    "a PNG of 30,000 x 30,000": lambda: png(30_000, 30_000),
+    "a JPEG that never says": lambda: b"\xff\xd8\xff" + b"\xff" * 2_000_000,
+    "a BMP": lambda: cv2.imencode(".bmp", np.zeros((4, 4, 3), np.uint8))[1].tobytes(),
 }
 
 
@@ -201,8 +201,9 @@ PICTURES = {
 def test_a_pushed_picture_is_judged_by_its_real_format_before_it_is_decoded(
     service: Victim, stream: str, frames: list[Frame], name: str
 ) -> None:
+    picture = PICTURES[name]()
     with service.attacked():
-        answers = [push(service, stream, body_of(frames[0]) | {key: PICTURES[name]}) for key in ("rgb", "depth")]
+        answers = [push(service, stream, body_of(frames[0]) | {key: picture}) for key in ("rgb", "depth")]
     assert all(answer.status_code in (413, 422) for answer in answers), [answer.text for answer in answers]
 
 
@@ -229,20 +230,22 @@ def intrinsics(**values: float) -> bytes:
     return json.dumps(camera | {"distortion": [0.1, 0, 0, 0]} | values).encode()
 
 
-UPLOADS = {
-    "a TIFF that is named PNG": {"rgb__1_png": tiff(9000, 9000)},
-    "a JPEG with its size behind 1 MB": {"rgb__1_png": jpeg(30_000, 30_000, 1 << 20)},
-    "a list of 8 million lines": {"rgb_txt": b"".join(b"%d a\n" % i for i in range(4_000_000))},
-    "a list without ends of lines": {"rgb_txt": b"0 " + b"a" * 100_000_000},
-    "intrinsics of 60,000 x 60,000": {"intrinsics_json": intrinsics(width=60_000, height=60_000, cx=3e4, cy=3e4)},
-    "intrinsics of 1e300": {"intrinsics_json": intrinsics(fx=1e300)},
-    "intrinsics of 20 MB of lists": {"intrinsics_json": b"[" + b"[]," * 7_000_000 + b"[]]"},
+UPLOADS: dict[str, Callable[[], dict[str, bytes]]] = {  # built in their test: up to 100 MB each
+    "a TIFF that is named PNG": lambda: {"rgb__1_png": tiff(9000, 9000)},
+    "a JPEG with its size behind 1 MB": lambda: {"rgb__1_png": jpeg(30_000, 30_000, 1 << 20)},
+    "a list of 8 million lines": lambda: {"rgb_txt": b"".join(b"%d a\n" % i for i in range(4_000_000))},
+    "a list without ends of lines": lambda: {"rgb_txt": b"0 " + b"a" * 100_000_000},
+    "intrinsics of 60,000 x 60,000": lambda: {
+        "intrinsics_json": intrinsics(width=60_000, height=60_000, cx=3e4, cy=3e4)
+    },
+    "intrinsics of 1e300": lambda: {"intrinsics_json": intrinsics(fx=1e300)},
+    "intrinsics of 20 MB of lists": lambda: {"intrinsics_json": b"[" + b"[]," * 7_000_000 + b"[]]"},
 }
 
 
 @pytest.mark.parametrize("name", UPLOADS)
 def test_an_upload_is_checked_before_it_is_read(service: Victim, name: str) -> None:
-    data = recording(**UPLOADS[name])
+    data = recording(**UPLOADS[name]())
     client = service.client
     map_id = f"up-{time.monotonic_ns()}"
     with service.attacked(seconds=15):
@@ -309,6 +312,6 @@ def test_one_message_costs_little_memory(service: Victim, name: str) -> None:
 @pytest.mark.parametrize("name", PICTURES)
 def test_a_compressed_image_of_ros_is_judged_before_it_is_decoded(name: str) -> None:
     pairs = FramePairs()
-    message = build("sensor_msgs/msg/CompressedImage", format="png", data=PICTURES[name])
+    message = build("sensor_msgs/msg/CompressedImage", format="png", data=PICTURES[name]())
     with pytest.raises(InputError, match=r"neither PNG nor JPEG|pixels"):
         pairs.add(COLOR, message)

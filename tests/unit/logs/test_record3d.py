@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -165,21 +166,23 @@ def test_a_file_without_frames_is_refused(tmp_path: Path, scene: Scene) -> None:
 @pytest.mark.parametrize(
     ("entry", "data", "field"),
     [
-        ("rgbd_2_depth", b"", "depth"),
-        ("rgbd_2_depth", liblzfse.compress(bytes(50_000_000)), "depth"),
-        ("rgbd_2_depth", liblzfse.compress(bytes(4 * 160 * 119)), "depth"),
-        ("rgbd_2_depth", bytes(50_000_000), "rgbd/2.depth"),  # a bomb of the ZIP file
-        ("rgbd_2_depth", liblzfse.compress(bytes(4 * 160 * 120)), "depth"),  # no valid pixel
-        ("rgbd_2_depth", liblzfse.compress(np.full(160 * 120, -1, np.float32).tobytes()), "depth"),
-        ("rgbd_2_conf", liblzfse.compress(bytes(5)), "conf"),
-        ("rgbd_2_conf", b"bvx-\xff\xff\xff\xff", "conf"),
-        ("rgbd_2_jpg", b"", "colour"),
-        ("rgbd_2_jpg", encoded(np.zeros((60, 80, 3), np.uint8), ".jpg"), "colour"),
-        ("rgbd_2_jpg", encoded(np.zeros((120, 160, 3), np.uint8), ".jpg")[:-2], "colour"),
+        ("rgbd_2_depth", lambda: b"", "depth"),
+        ("rgbd_2_depth", lambda: liblzfse.compress(bytes(50_000_000)), "depth"),
+        ("rgbd_2_depth", lambda: liblzfse.compress(bytes(4 * 160 * 119)), "depth"),
+        ("rgbd_2_depth", lambda: bytes(50_000_000), "rgbd/2.depth"),  # a bomb of the ZIP file
+        ("rgbd_2_depth", lambda: liblzfse.compress(bytes(4 * 160 * 120)), "depth"),  # no valid pixel
+        ("rgbd_2_depth", lambda: liblzfse.compress(np.full(160 * 120, -1, np.float32).tobytes()), "depth"),
+        ("rgbd_2_conf", lambda: liblzfse.compress(bytes(5)), "conf"),
+        ("rgbd_2_conf", lambda: b"bvx-\xff\xff\xff\xff", "conf"),
+        ("rgbd_2_jpg", lambda: b"", "colour"),
+        ("rgbd_2_jpg", lambda: encoded(np.zeros((60, 80, 3), np.uint8), ".jpg"), "colour"),
+        ("rgbd_2_jpg", lambda: encoded(np.zeros((120, 160, 3), np.uint8), ".jpg")[:-2], "colour"),
     ],
 )
-def test_one_damaged_image_spoils_its_frame_alone(file: Path, entry: str, data: bytes, field: str) -> None:
-    log = open_log(rewrite(file, **{entry: data}))
+def test_one_damaged_image_spoils_its_frame_alone(
+    file: Path, entry: str, data: Callable[[], bytes], field: str
+) -> None:
+    log = open_log(rewrite(file, **{entry: data()}))
     with pytest.raises(LogError, match=rf"scan\.r3d \(rgbd/2\.\w+\): {field}: .*Fix: "):
         log.read(2)
     assert log.read(3).index == 3
