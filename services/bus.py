@@ -207,6 +207,11 @@ class Bus:
         with self._lock:
             return len(self._readers)
 
+    def readers_of(self, topic: str) -> frozenset[Subscription]:
+        """Return the open subscriptions that receive the messages of a topic."""
+        with self._lock:
+            return frozenset(reader for reader in self._readers if reader.wants(topic))
+
     def close(self) -> None:
         """End every subscription, present and future; later messages have no readers."""
         with self._lock:

@@ -240,6 +240,10 @@ class RosGraph:
         with self._lock:
             return bool(self._users.get(topic, set()) - {0})
 
+    def readers_of(self, topic: str) -> frozenset[Subscription]:
+        """Return the open subscriptions that receive the messages of a topic."""
+        return self._bus.readers_of(topic)
+
     def on_leave(self, call: Callable[[int], None]) -> None:
         """Register a function that is called with the number of each client that leaves."""
         with self._lock:

@@ -15,6 +15,7 @@ from splatbot.geometry import inverse, pose_from_quat, so3_log
 from splatbot.logs.ros_frames import header, pose_message
 from splatbot.logs.ros_types import Message, build
 from splatbot.protocols import Array
+from splatbot.services.bus import Subscription
 from splatbot.services.ros.graph import RosGraph, Service
 from splatbot.services.ros.requests import entries, entry, number, seconds
 from splatbot.services.threads import join_started
@@ -46,7 +47,7 @@ CONSTANTS = TfRepublisherConstants()
 
 @dataclass
 class _Republication:
-    """One topic: ``sent`` has the latest sent T_target_source by source frame."""
+    """One topic: ``sent`` has the T_target_source by source frame that its ``readers`` have received last."""
 
     topic: str
     target: str
@@ -58,6 +59,7 @@ class _Republication:
     used: float
     due: float = 0.0
     sent: dict[str, Array] = field(default_factory=dict)
+    readers: frozenset[Subscription] = frozenset()
 
 
 class TfRepublisher:
@@ -115,7 +117,6 @@ class TfRepublisher:
                 now = time.monotonic()
                 self._topics[key] = _Republication(topic, target, sources, *limits, 1.0 / rate, timeout, now)
             self._topics[key].used = time.monotonic()
-            self._topics[key].sent.clear()  # a new reader gets every transform
             return {"topic_name": self._topics[key].topic}
 
     def _listen(self) -> None:
@@ -145,13 +146,22 @@ class TfRepublisher:
                 if self._graph.has_clients(one.topic):
                     one.used = now
                     self._send(one, parents)
-                elif now - one.used > one.timeout:
-                    with self._lock:
-                        self._topics.pop(key, None)
+                elif self._has_expired(key, one, now):
                     self._graph.remove_topics(one.topic)
 
+    def _has_expired(self, key: tuple[Any, ...], one: _Republication, now: float) -> bool:
+        """Return whether a topic has had no reader for its timeout; no later request gets its name then."""
+        with self._lock:
+            expired = now - one.used > one.timeout
+            if expired:
+                del self._topics[key]
+        return expired
+
     def _send(self, one: _Republication, parents: Mapping[str, tuple[str, Array]]) -> None:
-        moved = []
+        readers, moved = self._graph.readers_of(one.topic), []
+        if readers - one.readers:  # a new reader gets every transform
+            one.sent.clear()
+        one.readers = readers
         for source in one.sources:
             T = transform_between(parents, one.target, source)
             if T is not None and _has_moved(one, source, T):

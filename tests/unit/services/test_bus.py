@@ -25,6 +25,14 @@ def test_a_new_reader_begins_with_the_latest_value_of_each_topic() -> None:
         assert reader.get(0) is None
 
 
+def test_the_readers_of_a_topic_are_those_whose_patterns_match_until_they_close() -> None:
+    bus = Bus()
+    one, other = bus.subscribe("maps/*"), bus.subscribe("arms/*")
+    assert bus.readers_of("maps/desk") == {one}
+    other.close()
+    assert bus.readers_of("arms/fake") == frozenset()
+
+
 def test_a_pattern_takes_topics_that_come_later() -> None:
     bus = Bus()
     with bus.subscribe("maps/*/result") as reader:

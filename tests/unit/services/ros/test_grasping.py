@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -18,6 +17,7 @@ from splatbot.services.ros.publishers import GRASP_MARKERS, RosPublishers
 from splatbot.services.ros.wire import to_json
 from splatbot.services.store import MapStore
 from splatbot.workspace import Workspace
+from tests.waiting import until
 
 STEP = 0.004
 CENTRE, HALF = np.array([0.5, 0.05, 0.04]), np.array([0.02, 0.03, 0.04])
@@ -89,10 +89,8 @@ def test_grasps_of_the_block_hold_it_from_both_sides_best_first(graph: RosGraph)
         assert sum(grasp["pre_grasp_posture"]["points"][0]["positions"]) >= closed
         assert grasp["grasp_pose"]["header"]["frame_id"] == "map"
         assert len(grasp["joint_state"]["position"]) == 7
-    for _ in range(200):
-        if (told := graph.latched(GRASP_MARKERS)) is not None:
-            break
-        time.sleep(0.01)
+    until(lambda: graph.latched(GRASP_MARKERS) is not None)
+    told = graph.latched(GRASP_MARKERS)
     assert told is not None
     assert len(told.message.markers) == len(grasps)
 

@@ -58,6 +58,20 @@ def test_a_reader_gets_transforms_that_moved_more_than_the_thresholds(graph: Ros
             assert stamped.transform.translation.x == pytest.approx(x)
 
 
+def test_a_second_reader_gets_a_transform_that_does_not_move_however_late_it_subscribes(graph: RosGraph) -> None:
+    topic = ask(graph)
+    graph.advertise(topic, "tf2_web_republisher/TFArray", client=7)
+    first = graph.subscribe(topic, capacity=8)
+    graph.publish("/tf_static", transform_message(0.0, A, "map", "camera"))
+    assert first.get(30.0) is not None
+    assert ask(graph) == topic  # a second page
+    first.get(0.2)  # the round trip to it; the topic goes on meanwhile
+    second = graph.subscribe(topic, capacity=8)
+    news = second.get(30.0)
+    assert news is not None
+    assert news.value.message.transforms[0].transform.translation.x == pytest.approx(A[0, 3])
+
+
 def test_a_topic_without_a_reader_ends(graph: RosGraph) -> None:
     topic = ask(graph, timeout={"sec": 0, "nanosec": 100_000_000})
     other = graph.subscribe("/none", capacity=1)
