@@ -29,12 +29,14 @@ class SplatConstants:
     Args:
         edge: [m] edge length of a piece.
         max_pieces: largest number of pieces.
-        min_variance: [m²] covariances travel as 16-bit floats, whose steps are 6e-8 here.
+        min_variance: [m²] covariances travel as 16-bit floats, whose steps are 6e-8 near 0.
+        rounding: relative error of a 16-bit float, at most 2⁻¹¹.
     """
 
     edge: float = 0.5
     max_pieces: int = 256
     min_variance: float = 1.2e-7
+    rounding: float = 5e-4
 
 
 CONSTANTS = SplatConstants()
@@ -76,6 +78,10 @@ def splats(
 ) -> Splats:
     """Return the Gaussians as a browser draws them.
 
+    The shader projects covariances of 16-bit floats. Those of thin Gaussians, as surfels, may be indefinite, and the
+    shader tilts them or leaves them out. The error is at most ``rounding`` times the Frobenius norm. Each Gaussian gets
+    this variance at least, so that a round disc is drawn with a thickness of 2.7 % of its size.
+
     Args:
         model: the map, or a part of it.
         coloring: meaning of the colours. "rgb" shows the map's own; "depth" a camera's depth, red near and blue far.
@@ -84,7 +90,10 @@ def splats(
         scale_of: the map whose values give the ends of the colour scale. If None, ``model``.
     """
     with torch.no_grad():
-        spread = covariances(model).numpy() + np.eye(3, dtype=np.float32) * np.float32(CONSTANTS.min_variance)
+        exact = covariances(model)
+        lacking = CONSTANTS.rounding * torch.linalg.matrix_norm(exact) - model.scales.amin(1).square()
+        added = lacking.clamp_min(0.0) + CONSTANTS.min_variance
+        spread = (exact + added[:, None, None] * torch.eye(3)).numpy()
         opacity = model.opacities.numpy()[:, None]
     rgb = colors(model, coloring, T_world_camera=T_world_camera, scale_of=scale_of)
     return Splats(model.means.numpy(), spread, rgb, opacity)

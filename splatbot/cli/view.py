@@ -15,6 +15,7 @@ from splatbot.cli.tiled import check_tiled
 from splatbot.layouts import is_tiled_map, map_file
 
 if TYPE_CHECKING:
+    from splatbot.gaussians import GaussianModel
     from splatbot.services.store import MapStore
     from splatbot.tiles import TiledMap
     from splatbot.trajectory import Trajectory
@@ -35,6 +36,7 @@ def view(
     """Show a map's Gaussians in a web browser, with the camera's trajectory and the robot if they are known.
 
     Each browser of a tiled map receives the tiles of its view: the coarsest first, finer ones when its camera rests.
+    Surfels are drawn as thin Gaussians; `splatbot render` draws them as discs.
 
     Examples:
         splatbot view runs/demo
@@ -72,7 +74,7 @@ def view(
     trajectory = Trajectory.load(path) if path.exists() else None
     workspace = find_workspace(map)
     if html is not None:
-        _write_page(html, file, trajectory, workspace, robot)
+        _write_page(html, _loaded(file), trajectory, workspace, robot)
         return
     settings = load_settings(host=host)
     check_exposure(settings)
@@ -90,7 +92,8 @@ def view(
             trajectory=trajectory,
         )
     else:
-        viewer = Viewer(_store(file, trajectory, workspace), access, host=host, port=port, robot=robot)
+        store = _store(file.name, _loaded(file), trajectory, workspace)
+        viewer = Viewer(store, access, host=host, port=port, robot=robot)
     viewer.start()
     address = opening_address(access, host, viewer.port, to_terminal=sys.stdout.isatty())
     print(f"{address} shows {file}; Ctrl-C ends", flush=True)
@@ -100,26 +103,36 @@ def view(
         viewer.stop()
 
 
-def _write_page(html: Path, file: Path, trajectory: Trajectory | None, workspace: Workspace | None, robot: str) -> None:
-    from splatbot.atomic import atomic_write
+def _loaded(file: Path) -> GaussianModel:
+    """Load a map, and say how its surfels are drawn."""
     from splatbot.gaussians import GaussianModel
+    from splatbot.gaussians.surfels import holds_surfels
+
+    model = GaussianModel.load(file)
+    if holds_surfels(model):
+        print(f"{file.name} holds surfels: browsers draw thin Gaussians, `splatbot render` draws discs", flush=True)
+    return model
+
+
+def _write_page(
+    html: Path, model: GaussianModel, trajectory: Trajectory | None, workspace: Workspace | None, robot: str
+) -> None:
+    from splatbot.atomic import atomic_write
     from splatbot.services.viewer.page import map_page
 
-    page = map_page(GaussianModel.load(file), trajectory=trajectory, workspace=workspace, robot=robot)
+    page = map_page(model, trajectory=trajectory, workspace=workspace, robot=robot)
     with atomic_write(html) as handle:
         handle.write(page.encode())
     print(f"{html}: {html.stat().st_size / 1e6:.1f} MB")
 
 
-def _store(file: Path, trajectory: Trajectory | None, workspace: Workspace | None) -> MapStore:
-    """Return the store of one map."""
-    from splatbot.gaussians import GaussianModel, Snapshot
+def _store(name: str, model: GaussianModel, trajectory: Trajectory | None, workspace: Workspace | None) -> MapStore:
+    """Return the store of one map, of a file of that name."""
+    from splatbot.gaussians import Snapshot
     from splatbot.services.store import MapStore
 
-    store, snapshot = MapStore(), Snapshot(GaussianModel.load(file), 1)
-    store.add(
-        "default", source=file.name, state="static", snapshot=snapshot, trajectory=trajectory, workspace=workspace
-    )
+    store, snapshot = MapStore(), Snapshot(model, 1)
+    store.add("default", source=name, state="static", snapshot=snapshot, trajectory=trajectory, workspace=workspace)
     return store
 
 

@@ -1,4 +1,4 @@
-"""`splatbot view` of a tiled map: refused options, and the page of a real process."""
+"""`splatbot view`: how surfels are drawn; of a tiled map, refused options and the page of a real process."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from splatbot.formats.ply import save_ply
+from splatbot.gaussians.surfels import as_surfels
 from splatbot.tiles import write_tiles
 from tests.unit.cli.conftest import RunCommand, assert_fix_named
 from tests.unit.services.viewer.viser_client import ViserClient
@@ -40,6 +41,17 @@ def test_a_value_that_cannot_be_kept_is_refused(
     run: RunCommand, tiled: Path, words: tuple[object, ...], mistake: str
 ) -> None:
     assert_fix_named(run("view", tiled, "--port", 0, *words), mistake)
+
+
+def test_a_map_of_surfels_says_that_a_browser_draws_thin_gaussians_and_another_map_does_not(
+    run: RunCommand, work_folder: Path
+) -> None:
+    maps = {"surfels.ply": as_surfels(building(50)), "map.ply": building(50)}
+    for name, model in maps.items():
+        save_ply(model, work_folder / name, bookkeeping=True)
+    printed = {name: run("view", work_folder / name, "--html", work_folder / "page.html").out for name in maps}
+    assert "surfels.ply holds surfels: browsers draw thin Gaussians" in printed["surfels.ply"]
+    assert "holds surfels" not in printed["map.ply"]
 
 
 @pytest.mark.long

@@ -63,6 +63,23 @@ def test_the_thinnest_gaussian_survives_16_bit_floats() -> None:
     assert np.linalg.eigvalsh(splats.covariances.astype(np.float16)[0].astype(float)).min() > 0
 
 
+def test_surfels_of_all_sizes_stay_discs_in_16_bit_floats(rng: np.random.Generator) -> None:
+    sizes = np.geomspace(1e-3, 3.0, 500)[:, None] * rng.uniform(0.2, 1.0, (500, 2))
+    model = GaussianModel.from_activated(
+        means=np.zeros((500, 3)),
+        quats=rng.normal(size=(500, 4)),
+        scales=np.column_stack([sizes, np.full(500, 1e-9)]),
+        opacities=np.full(500, 0.5),
+        colors=np.ones((500, 3)),
+    )
+    (found,) = pieces(model).values()
+    drawn = np.linalg.eigvalsh(found.covariances.astype(np.float16).astype(float))
+    longest = sizes.max(1)
+    assert drawn[:, 0].min() > 0  # viser's shader leaves out what is not
+    assert (np.sqrt(drawn[:, 0]) < 0.04 * longest + 5e-4).all()
+    np.testing.assert_allclose(np.sqrt(drawn[:, 2]), longest, rtol=2e-3, atol=3e-4)
+
+
 @pytest.mark.parametrize("coloring", COLORINGS)
 def test_every_colouring_gives_colours(coloring: str, rng: np.random.Generator) -> None:
     model = _model(rng, 50)
