@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -82,6 +82,7 @@ class FakeRosArm(FakeRosbridge):
 
     Attributes:
         position: (J,) of the arm [rad].
+        push: (J,) position [rad] by the monotonic clock [s] while something else moves the arm.
         commands: rows (time since the start of the goal, J positions) of the set points.
         cancels: number of cancellations that arrived.
     """
@@ -96,6 +97,8 @@ class FakeRosArm(FakeRosbridge):
         self.goals: list[Mapping[str, Any]] = []
         self.cancels, self.stalled = 0, False
         self.clock_offset = 0.0
+        self.push: Callable[[float], Array] | None = None
+        self._now, self._epoch = 0.0, time.time() - time.monotonic()  # of a tick, and between the clocks [s]
         self._goal: Goal | None = None
         super().__init__(_PERIOD_S)
 
@@ -156,8 +159,11 @@ class FakeRosArm(FakeRosbridge):
     # -- the arm -----------------------------------------------------------------------------------------------------
 
     def _tick(self, ticks: int) -> None:
+        self._now = time.monotonic()  # of the position and its stamp: a busy machine may pause between them
+        if self.push is not None:
+            self.position = self.push(self._now)
         if self._goal is not None:
-            self._control(self._goal, time.monotonic() - self._goal.started, ticks)
+            self._control(self._goal, self._now - self._goal.started, ticks)
         if ticks % 2 == 0 and not self.stalled:
             self._report_states()
 
@@ -233,7 +239,7 @@ class FakeRosArm(FakeRosbridge):
         )
 
     def _states(self, names: tuple[str, ...], position: Array, velocity: Array) -> dict[str, Any]:
-        now = time.time() + self.clock_offset
+        now = self._now + self._epoch + self.clock_offset
         clock = ("sec", "nanosec") if self.ros == 2 else ("secs", "nsecs")
         stamp = dict(zip(clock, divmod(int(now * 1e9), 10**9), strict=True))
         given = [] if self.behaviour.positions_only else velocity.tolist()

@@ -89,7 +89,7 @@ class FakeRosGripper(FakeRosbridge):
         self.cancels, self.stalled = 0, False
         self.last: tuple[str, ServerConnection] | None = None
         self._goal: HandGoal | None = None
-        self._moved_at = time.monotonic()
+        self._moved_at, self._epoch = time.monotonic(), time.time() - time.monotonic()
         super().__init__(_PERIOD_S)
 
     def repeat_result(self, name: str, status: int) -> None:
@@ -191,7 +191,8 @@ class FakeRosGripper(FakeRosbridge):
         return {"position": self.finger, "effort": 0.0}
 
     def _report_state(self) -> None:
-        stamp = dict(zip(("sec", "nanosec"), divmod(time.time_ns(), 10**9), strict=True))
+        now = round(1e9 * (self._moved_at + self._epoch))  # of the position: a busy machine may pause meanwhile
+        stamp = dict(zip(("sec", "nanosec"), divmod(now, 10**9), strict=True))
         names, position = ["panda_joint1", JOINT, "panda_finger_joint2"], [9.0, self.finger, self.finger]
         header = {"stamp": stamp, "frame_id": ""}
         message = {"header": header, "name": names, "position": position, "velocity": [], "effort": []}

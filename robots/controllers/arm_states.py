@@ -84,8 +84,15 @@ class ArmStates:
     @property
     def rests(self) -> bool:
         """True if the arm did not move in the last states, whose time counts by stamps, too: they may arrive late."""
+        return self.rests_since(-np.inf)
+
+    def rests_since(self, arrived: float) -> bool:
+        """Return whether the arm did not move in the last states that arrived after a time [s] of the monotonic clock.
+
+        After a lost connection, earlier states do not count.
+        """
         with self._lock:
-            samples = list(self._samples)
+            samples = [] if self._restarted else [each for each in self._samples if each.arrived > arrived]
         if not samples or _span(samples[0], samples[-1]) < _LEAST_S:
             return False
         return bool(np.ptp([sample.position for sample in samples], axis=0).max() <= _STILL)

@@ -133,10 +133,16 @@ class RosController(LiveController):
         return True
 
     def _may_move(self) -> bool:
-        """Return whether a goal may still run; it is over when the arm is seen at rest."""
-        if self._goal is not None and self._wait(
-            lambda: self._states.age <= self.options.max_age and self._states.rests, _SETTLE_S
-        ):
+        """Return whether a goal may still run; it is over when the arm is seen at rest.
+
+        While a connection is lost, it may run: the goal is cancelled when the connection is back.
+        """
+
+        def rests() -> bool:
+            connected = self._goals.connected and self._reports.connected
+            return connected and self._states.age <= self.options.max_age and self._states.rests
+
+        if self._goal is not None and self._wait(rests, _SETTLE_S):
             self._goal = None
         return self._goal is not None
 

@@ -103,8 +103,8 @@ class RosbridgeLink:
             with suppress(WebSocketException, OSError):
                 for text in socket:
                     self._read(text)
+            self._socket = None  # first: a thread that reads the count then finds no connection
             self.losses += 1
-            self._socket = None
 
     def _read(self, text: str | bytes) -> None:
         try:

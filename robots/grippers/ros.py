@@ -156,6 +156,7 @@ class RosGripper:
         self._result: GripperResult | None = GripperResult(_CANCELED)  # no goal: at rest, with nothing held
         self._target = math.nan  # commanded opening [m]
         self._begun, self._losses = 0.0, 0
+        self._ended = -math.inf  # when the result of the latest goal arrived
         self._pending = 0  # calls of the service that cancels
         with _as_line_error(address):
             self._goals = RosbridgeLink(address, list, self._take_news)
@@ -213,7 +214,7 @@ class RosGripper:
         """Return whether a goal runs, or the fingers move."""
         with self._secured():
             self._check()
-            return self._result is None or not self._states.rests
+            return not self._rests()
 
     def opening(self) -> float:
         """Return the distance between the fingers [m]."""
@@ -228,7 +229,7 @@ class RosGripper:
         """
         with self._secured():
             self._check()
-            if self._result is None or self._stopped or math.isnan(self._target) or not self._states.rests:
+            if self._result is None or self._stopped or math.isnan(self._target) or not self._rests():
                 return False
             return self._result.stalled or abs(self._opening() - self._target) > self.options.tolerance
 
@@ -242,7 +243,7 @@ class RosGripper:
 
             def rests() -> bool:
                 self._check()
-                return self._result is not None and self._states.rests
+                return self._rests()
 
             if not self._wait(rests, seconds):
                 raise NoAnswerError(f"still moves after {seconds:g} s.", field=self._action, hint="look at the gripper")
@@ -263,6 +264,10 @@ class RosGripper:
             return {"position": position, "max_effort": force}
         velocity = [] if speed is None else [joint.velocity(speed)]
         return {"name": [joint.name], "position": [position], "velocity": velocity, "effort": [force * joint.lever]}
+
+    def _rests(self) -> bool:
+        """Return whether the goal has ended and the fingers rest; its result may overtake the states of the motion."""
+        return self._result is not None and self._states.rests_since(self._ended)
 
     def _opening(self) -> float:
         latest = self._states.latest()
@@ -347,6 +352,7 @@ class RosGripper:
             return  # of an earlier goal
         if operation["op"] == "action_result":
             with self._news:
+                self._ended = time.monotonic()  # first: other threads read the result and then this time
                 self._result, self._running = _result(operation), False
                 self._news.notify_all()
         elif self._stopped:  # feedback of a goal that began after its cancellation

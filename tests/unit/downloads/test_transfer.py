@@ -7,6 +7,7 @@ import time
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -145,7 +146,7 @@ def test_the_wait_follows_retry_after_up_to_its_limit(
     server: FileServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     waits: list[float] = []
-    monkeypatch.setattr("splatbot.downloads.transfer.time.sleep", waits.append)
+    monkeypatch.setattr("splatbot.downloads.transfer.time", SimpleNamespace(sleep=waits.append))
     server.answers += [refuse(503, Retry_After=7), refuse(503, Retry_After=999_999)]
     get(server.add("/a.tgz", CONTENT), tmp_path / "a")
     assert waits == [7.0, PATIENCE.longest_wait]

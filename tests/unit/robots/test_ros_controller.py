@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -222,21 +221,11 @@ def test_repeated_joint_states_are_stale_although_they_arrive(motion: CertifiedM
 def test_an_arm_that_moves_already_refuses_a_start(motion: CertifiedMotion, monkeypatch: pytest.MonkeyPatch) -> None:
     with connected() as (controller, arm):
         monkeypatch.setattr(ros_controller, "_SETTLE_S", 0.5)
-        begin, ended = time.monotonic(), threading.Event()
-
-        def push() -> None:
-            while not ended.wait(0.004):
-                arm.position = PANDA.home + 0.005 * np.sin(5.0 * (time.monotonic() - begin))
-
-        pusher = threading.Thread(target=push)
-        pusher.start()
-        try:
-            until(lambda: np.abs(controller.step().position - PANDA.home).max() > 2e-3)
-            with pytest.raises(ControllerError, match="moves"):
-                controller.send(motion)
-        finally:
-            ended.set()
-            pusher.join()
+        begin = time.monotonic()
+        arm.push = lambda now: PANDA.home + 0.02 * (now - begin)  # 2 mrad within the least time of a rest
+        until(lambda: np.abs(controller.step().position - PANDA.home).max() > 2e-3)
+        with pytest.raises(ControllerError, match="moves"):
+            controller.send(motion)
 
 
 @pytest.mark.parametrize("ros", [1, 2])
@@ -325,6 +314,22 @@ def test_a_lost_connection_is_a_fault_at_once_and_the_goal_is_cancelled_when_it_
         controller.reset()
         back = time_path(path_of(np.stack([arm.position, PANDA.home])), ARM, None)
         assert follow(controller, certify_motion(back.slowed(3.0), ARM, None))
+
+
+def test_the_goal_of_a_lost_connection_may_run_although_the_last_states_show_no_motion(
+    trajectory: JointTrajectory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    creeping = certify_motion(trajectory.slowed(100.0), ARM, None)  # less than 1 mrad within 0.3 s of its start
+    with connected(options=replace(PATIENT, max_age=120.0)) as (controller, arm):
+        controller.send(creeping)
+        arm._cut()
+        while controller.step().state is MotionState.MOVING:
+            pass
+        monkeypatch.setattr(ros_controller, "_SETTLE_S", 0.3)
+        controller.reset()
+        assert controller.state is MotionState.FAULT
+        arm._server = arm._serve(arm.port)
+        until(lambda: arm.cancels >= 1)
 
 
 def test_an_interrupted_follow_cancels_the_goal(slow: CertifiedMotion) -> None:

@@ -132,6 +132,20 @@ def test_a_goal_that_succeeds_early_is_not_a_hold() -> None:
         assert not gripper.holds()
 
 
+def test_a_result_that_overtakes_the_states_of_the_motion_does_not_end_it() -> None:
+    with connected(RosGripperOptions(max_age=120.0)) as (gripper, hand):
+        gripper.wait(60.0)
+        hand.stalled = True  # the states are under way
+        gripper.move(0.0)
+        until(lambda: gripper._result is not None)
+        assert gripper.opening() == pytest.approx(0.08)
+        assert gripper.moving()
+        assert not gripper.holds()
+        hand.stalled = False
+        gripper.wait(60.0)
+        assert gripper.opening() == 0.0
+
+
 def test_a_stop_from_another_thread_cancels_the_goal() -> None:
     with connected(speed=0.01) as (gripper, hand):
         gripper.move(0.0)
