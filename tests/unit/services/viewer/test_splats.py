@@ -75,7 +75,7 @@ def test_surfels_of_all_sizes_stay_discs_in_16_bit_floats(rng: np.random.Generat
     (found,) = pieces(model).values()
     drawn = np.linalg.eigvalsh(found.covariances.astype(np.float16).astype(float))
     longest = sizes.max(1)
-    assert drawn[:, 0].min() > 0  # viser's shader leaves out what is not
+    assert drawn[:, 0].min() > 0  # viser's shader leaves out others
     assert (np.sqrt(drawn[:, 0]) < 0.04 * longest + 5e-4).all()
     np.testing.assert_allclose(np.sqrt(drawn[:, 2]), longest, rtol=2e-3, atol=3e-4)
 
