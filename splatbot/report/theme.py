@@ -59,9 +59,16 @@ def figure(columns: int = 1, *, width: float = 9.0, height: float = 3.0) -> tupl
 
 
 def png(fig: Figure, *, dpi: int = 140) -> bytes:
-    """Encode the figure as a PNG with a transparent background."""
+    """Encode the figure as a PNG with a transparent background.
+
+    ``Figure.savefig`` draws each figure twice, the first time without pixels; here the only draw computes the layout.
+    """
+    fig.set_dpi(dpi)
+    for patch in (fig.patch, *(ax.patch for ax in fig.axes)):
+        patch.set_facecolor("none")
+        patch.set_edgecolor("none")
     buffer = io.BytesIO()
-    fig.savefig(buffer, format="png", dpi=dpi, transparent=True)
+    FigureCanvasAgg(fig).print_png(buffer)
     return buffer.getvalue()
 
 
