@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -12,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 
+from splatbot.cli import main
 from splatbot.collision import RobotSpheres
 from splatbot.robots.panda import panda
 from splatbot.sim.motion import load_motion
@@ -24,6 +28,20 @@ from tests.unit.sim.test_page import document
 pytest.importorskip("mujoco")
 
 
+@pytest.fixture(scope="module")
+def searched(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a map, its scene file and the grasps of one search, which each test copies."""
+    folder = tmp_path_factory.mktemp("searched")
+    model().save(folder / "map.ply")
+    Workspace(T_world_base=np.eye(4)).save(folder / "scene.yaml")
+    words = ("--map", folder / "map.ply", "--target", "red box", "--wanted", 3, "--margin", 0.004)
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        assert main(["grasp", *map(str, words), "--out", str(folder / "grasp")]) == 0
+    assert "splatbot plan-pick --map" in printed.getvalue()
+    return folder
+
+
 @pytest.fixture
 def map_file(tmp_path: Path) -> Path:
     path = tmp_path / "map.ply"
@@ -33,12 +51,8 @@ def map_file(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def grasps(run: RunCommand, map_file: Path, tmp_path: Path) -> Path:
-    words = ("--target", "red box", "--wanted", 3, "--margin", 0.004, "--out", tmp_path / "grasp")
-    answer = run("grasp", "--map", map_file, *words)
-    assert answer.code == 0, answer.err
-    assert "splatbot plan-pick --map" in answer.out
-    return tmp_path / "grasp" / "grasp.json"
+def grasps(searched: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(searched / "grasp", tmp_path / "grasp")) / "grasp.json"
 
 
 def test_the_box_is_held_in_the_twin_and_each_motion_clears_the_true_objects(
