@@ -108,16 +108,16 @@ def draw_robot(
     fine = (camera.height * CONSTANTS.samples, camera.width * CONSTANTS.samples)
     hits = scene.cast_rays(o3d.core.Tensor.from_numpy(_rays(camera, T_world_camera)))
     reach = hits["t_hit"].numpy().reshape(fine)  # of directions with z = 1, so that it is depth
-    hit = np.isfinite(reach)
-    owner = np.where(hit, hits["geometry_ids"].numpy().reshape(fine), 0).astype(np.int64)
-    normals = hits["primitive_normals"].numpy().reshape(*fine, 3) @ T_world_camera[:3, :3]
-    # Triangles have two sides; light comes from above and behind the camera.
-    facing = np.where(normals[..., 2:] > 0, -normals, normals) @ (-_LIGHT)
-    shade = CONSTANTS.ambient + (1 - CONSTANTS.ambient) * np.clip(facing, 0.0, 1.0)
     known = np.repeat(np.repeat(np.where(depth > 0, depth, np.inf), CONSTANTS.samples, 0), CONSTANTS.samples, 1)
-    shown = hit & (reach < known)
-    cover = opacity * _pixels(shown.astype(np.float64), camera)
-    paint = _pixels(np.where(shown[..., None], colors[owner] * shade[..., None], 0.0), camera)
+    shown = np.isfinite(reach) & (reach < known)
+    owner = hits["geometry_ids"].numpy().reshape(fine)[shown]
+    normals = hits["primitive_normals"].numpy().reshape(*fine, 3)[shown] @ T_world_camera[:3, :3]
+    # Triangles have two sides; light comes from above and behind the camera.
+    facing = np.where(normals[:, 2:] > 0, -normals, normals) @ (-_LIGHT)
+    shade = CONSTANTS.ambient + (1 - CONSTANTS.ambient) * np.clip(facing, 0.0, 1.0)
+    lit = np.zeros((*fine, 3))
+    lit[shown] = colors[owner] * shade[:, None]
+    cover, paint = opacity * _pixels(shown.astype(np.float64), camera), _pixels(lit, camera)
     view[:] = view * (1 - cover[..., None]) + opacity * paint
     if opacity == 1.0:
         nearest = np.where(shown, reach, np.inf)
