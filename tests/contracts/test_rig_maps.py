@@ -140,12 +140,12 @@ def test_a_rig_that_names_something_else_makes_no_map(service: Service, places: 
     (root / "huge.json").write_text(intrinsics)
     for name, (text, status, why) in REFUSED.items():
         (root / "bad.yaml").write_text(text.replace("SECRET", str(places / "secret/table")))
-        began = time.monotonic()
+        began = time.process_time()  # of the service, too; other programs take no part in it
         answer = service.client.post("/v1/maps", json={"id": "bad", "log": "bad.yaml"})
         assert answer.status_code == status, (name, answer.text)
         assert why in answer.text, (name, answer.text)
         assert str(places) not in answer.text, name  # of the server
-        assert time.monotonic() - began < 5.0, name
+        assert time.process_time() - began < 5.0, name
     assert "bad" not in {found["id"] for found in service.client.get("/v1/maps").json()["maps"]}
 
 
