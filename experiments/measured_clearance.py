@@ -1,10 +1,8 @@
 """Measure how near certified paths pass measured points: `python -m experiments.measured_clearance RUN ...`.
 
-`--other-frames` takes the points of frames that neither the audit nor the search for measured surface used.
-
 The paths are those of `splatbot plan` in a run folder with its defaults. The margin is the audited error of the region
-of each motion, and the support plane is an obstacle. The audit samples 5,000 pixels of a frame; here all pixels of the
-same frames propose points. A point counts if another frame measures the same depth there. The script needs no truth.
+of each motion, and the support plane is an obstacle. The audit samples 5,000 pixels of 40 frames; here all pixels
+of all frames propose points. A point counts if another frame measures the same depth there. The script needs no truth.
 
 A path keeps the margin from the map. A point that is outside of the map may be nearer by the distance between both.
 """
@@ -15,6 +13,7 @@ import inspect
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -33,7 +32,7 @@ from splatbot.protocols import Array
 from splatbot.results.folder import RunFolder
 from splatbot.results.margin import CONSTANTS as MARGIN
 from splatbot.results.margin import AuditedError, audited_error
-from splatbot.results.measured import surface_outside
+from splatbot.results.measured import MeasuredSurface
 from splatbot.results.plan_obstacles import PlanObstacles
 from splatbot.results.region_plan import RegionPlan, plan_in_region
 from splatbot.results.views import raw_views
@@ -52,14 +51,16 @@ class MeasuredClearanceConstants:
         problems_per_path: largest number of problems for each path; the ends of some are not free with the margin.
         voxel: [m] edge of the voxels in which a frame proposes at most one point.
         max_points: largest number of proposed points.
+        max_frames: largest number of frames.
         step: [rad] mean distance between compared configurations.
         search: [m] distance beyond the margin in which a nearest point is searched.
     """
 
     paths: int = 100
     problems_per_path: int = 4
-    voxel: float = 0.003
-    max_points: int = 2_000_000
+    voxel: float = 0.001
+    max_points: int = 10_000_000
+    max_frames: int = 1000
     step: float = 1 / 256
     search: float = 0.05
 
@@ -107,11 +108,8 @@ class PathClearance:
     outside: float
 
 
-def open_scene(run: Path, *, other_frames: bool = False) -> MappedScene:
-    """Open a run, place the arm as `splatbot bench planning --run` does, and find the measured points in its reach.
-
-    With ``other_frames`` the points are those of frames that plans do not use.
-    """
+def open_scene(run: Path) -> MappedScene:
+    """Open a run, place the arm as `splatbot bench planning --run` does, and find the measured points in its reach."""
     folder = RunFolder(run)
     model = GaussianModel.load(run / "map.ply")
     field = GaussianCollisionField(model, _PLAN["n_sigma"], min_observations=_PLAN["min_observations"])
@@ -121,11 +119,8 @@ def open_scene(run: Path, *, other_frames: bool = False) -> MappedScene:
         raise InputError("is not known.", file=run / "scene.yaml", field="T_world_base, workspace", hint=hint)
     log, sensor, robot = reopen_log(folder), folder.load_config().sensor, panda()
     reach, base = robot.chain.reach(robot.T_link_tcp), place.T_world_base[:3, 3]
-    used, views = raw_views(folder, log)
-    if other_frames:
-        _, views = raw_views(folder, log, without=used)
     points = confirmed_near(
-        views,
+        raw_views(folder, log, CONSTANTS.max_frames)[1],
         base - reach,
         base + reach,
         floor=sensor.sigma_depth_floor,
@@ -136,7 +131,7 @@ def open_scene(run: Path, *, other_frames: bool = False) -> MappedScene:
     )
     error = audited_error(run, log, field)
     arm = RobotSpheres(robot, T_world_base=place.T_world_base)
-    measured = surface_outside(folder, log, field, arm)
+    measured = MeasuredSurface(folder, partial(reopen_log, folder), model, field).near(arm)
     return MappedScene(model, field, place.T_world_base, place.support_plane, place.box, error, measured, points)
 
 
@@ -242,12 +237,10 @@ def _share(chosen: NDArray[np.bool_]) -> str:
 
 def main(argv: Sequence[str]) -> None:
     """Print the counts of each run."""
-    other = "--other-frames" in argv
-    names = [word for word in argv if word != "--other-frames"]
-    if not names:
-        raise SystemExit("give run folders: python -m experiments.measured_clearance [--other-frames] RUN ...")
-    for name in names:
-        scene = open_scene(Path(name), other_frames=other)
+    if not argv:
+        raise SystemExit("give run folders: python -m experiments.measured_clearance RUN ...")
+    for name in argv:
+        scene = open_scene(Path(name))
         print(f"{name}: {len(scene.points):,} points that two frames measure", flush=True)
         found, tried = measure(scene, CONSTANTS.paths)
         if not found:

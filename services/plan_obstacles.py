@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from splatbot.collision import RobotSpheres
 from splatbot.collision.unknown import UnknownPolicy
 from splatbot.errors import InputError, SplatbotError
-from splatbot.results.measured import surface_outside
+from splatbot.results.measured import MeasuredSurface
 from splatbot.results.plan_obstacles import PlanObstacles
 from splatbot.results.unknown import unknown_in_reach
 from splatbot.robots.in_view import reopen_log
@@ -30,8 +30,8 @@ def plan_obstacles(
 ) -> PlanObstacles:
     """Return the obstacles of a plan: the map, its support plane, measured surface, and unknown space under a policy.
 
-    The searches for unknown space and for measured surface take seconds, once for each map version, robot and base.
-    :func:`check_unknown` comes first.
+    The search for unknown space takes seconds, once for each map version and robot. That for measured surface takes
+    seconds too, once for each part of the map that an arm reaches. :func:`check_unknown` comes first.
 
     Args:
         served: the map.
@@ -56,9 +56,9 @@ def plan_obstacles(
         assert run is not None  # by margin_source
         try:
             surface = served.derived.get(
-                ("measured surface", robot.name, T_world_base.tobytes()),
-                lambda: surface_outside(run, reopen_log(run), served.field, arm),
-            )
+                "measured surface",
+                lambda: MeasuredSurface(run, lambda: reopen_log(run), served.ready.model, served.field),
+            ).near(arm)
         except SplatbotError:
             if margin.required:
                 raise

@@ -150,14 +150,14 @@ def map_obstacles(
         start: (J,) configuration at which it is [rad or m].
         unknown: treatment of unknown space, which takes seconds to find unless it is free.
         support: whether the support plane of the scene.yaml is an obstacle.
-        measured: whether measured surface that the map lacks is an obstacle, which takes seconds to find.
+        measured: whether measured surface that the map lacks is an obstacle, which takes seconds to find once.
 
     Raises:
         InputError: unknown space or measured surface is wanted, and the map is in no run's folder.
         FormatError: the run or the scene.yaml is damaged.
         LogError: the log of the run is damaged.
     """
-    from splatbot.results.measured import surface_outside
+    from splatbot.results.measured import MeasuredSurface
     from splatbot.results.plan_obstacles import PlanObstacles
     from splatbot.results.unknown import unknown_in_reach
     from splatbot.robots.in_view import reopen_log
@@ -169,7 +169,7 @@ def map_obstacles(
         space = unknown_in_reach(run, reopen_log(run), arm)
     if measured:
         run = run_folder(map_, "--margin auto")
-        surface = surface_outside(run, reopen_log(run), field, arm)
+        surface = MeasuredSurface(run, lambda: reopen_log(run), model, field).near(arm)
     known = find_workspace(map_) if support else None
     plane = None if known is None else known.support_plane
     return PlanObstacles(field, model, arm, start, plane=plane, measured=surface, space=space, policy=unknown)

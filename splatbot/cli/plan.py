@@ -316,7 +316,7 @@ _SUPPORT = {
     False: "NOT COVERED beyond the map: no scene.yaml has it, the base is below it, or --no-support",
 }
 _MEASURED = {
-    True: "covered: points outside of the map that two of 40 frames agree on",
+    True: "covered: points outside of the map that two frames agree on",
     False: "points that the map lacks are NOT COVERED; --margin auto covers them",
 }
 _UNKNOWN = {

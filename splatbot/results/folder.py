@@ -87,6 +87,7 @@ class RunFolder:
         self.report = self.path / "report.html"
         self.map_page = self.path / "map.html"
         self.audit = self.path / "audit.json"
+        self.measured = self.path / "measured_surface.npz"
         self.is_new = False
 
     def trajectory_of(self, camera_name: str) -> Path:
@@ -140,7 +141,7 @@ class RunFolder:
                 self.metrics.name: write_text(_metrics_text(metrics)),
             },
             # a run that is killed from here on has no checksums
-            remove=(self.report.name, self.map_page.name, self.audit.name, self.mapped.name, *older, SUMS),
+            remove=(*self._about_the_map(), self.mapped.name, *older, SUMS),
         )
         write_sums(self.path, self._files())
 
@@ -155,7 +156,7 @@ class RunFolder:
         replace_files(
             self.path,
             {self.map.name: lambda path: save_ply(model, path, bookkeeping=True)},
-            remove=(self.report.name, self.map_page.name, self.audit.name, SUMS),
+            remove=(*self._about_the_map(), SUMS),
         )
         write_sums(self.path, self._files())
 
@@ -280,6 +281,10 @@ class RunFolder:
         paths = [self.config, self.trajectory, self.frames, self.metrics, self.map]
         paths += [self.report, self.map_page, self.audit, *self._further_trajectories()]
         return [path.name for path in paths]
+
+    def _about_the_map(self) -> tuple[str, ...]:
+        """Return the names of the files that describe a map, without its checksums."""
+        return tuple(path.name for path in (self.report, self.map_page, self.audit, self.measured))
 
     def _further_trajectories(self) -> list[Path]:
         return sorted(self.path.glob("trajectory-*.tum"))

@@ -17,7 +17,7 @@ SUMMARY = "merge.json"
 _ELSEWHERE = "name another folder"
 _OF_RUNS = {
     *(MAP_NAME, "map.mapped.ply", "map.html", "config.yaml", "frames.jsonl", "trajectory.tum", "metrics.json"),
-    *("audit.json", "report.html", SUMS, "state", RECORDINGS, SUMMARY),
+    *("audit.json", "measured_surface.npz", "report.html", SUMS, "state", RECORDINGS, SUMMARY),
 }
 """Files and folders of a run that another run replaces; those of further cameras, ``trajectory-*.tum``, too."""
 

@@ -98,7 +98,7 @@ class PlanObstacles:
         start: (J,) configuration at which it is [rad or m].
         plane: (4,) support plane of the map, see :func:`support_tiles`. If None, no plane is known or wanted.
         measured: (M, 4) spheres around measured surface outside of the map [m, world], see
-            :func:`splatbot.results.measured.surface_outside`. If None, it is not known or not wanted.
+            :class:`splatbot.results.measured.MeasuredSurface`. If None, it is not known or not wanted.
         space: unknown space of the map. If None, it counts as free.
         policy: treatment of unknown space.
     """

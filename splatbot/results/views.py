@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -75,7 +75,6 @@ def raw_views(
     most: int = CONSTANTS.max_frames_in_memory,
     *,
     masked: float = 0.0,
-    without: Collection[int] = (),
 ) -> tuple[list[int], tuple[DepthView, ...]]:
     """Return the frames of :func:`subsampled_views` with all depth that the sensor gave outside of masks, rectified.
 
@@ -87,7 +86,6 @@ def raw_views(
         log: the log of the run, with the same masks.
         most: largest number of frames.
         masked: value of masked pixels [m], 0 or NaN.
-        without: positions in the log that are left out.
 
     Returns:
         Positions in the log, and views.
@@ -97,7 +95,7 @@ def raw_views(
         LogError: the log is damaged.
     """
     poses = run.load_poses()
-    indices, rectified = evenly_spaced(sorted(poses.keys() - set(without)), most), rectified_log(run, log)
+    indices, rectified = evenly_spaced(sorted(poses), most), rectified_log(run, log)
     views = []
     for index in indices:
         frame = rectified[index]

@@ -9,6 +9,7 @@ void define_arm(nanobind::module_& m);
 void define_depth(nanobind::module_& m);
 void define_field(nanobind::module_& m);
 void define_matching(nanobind::module_& m);
+void define_measurements(nanobind::module_& m);
 void define_optimize(nanobind::module_& m);
 void define_path_speed(nanobind::module_& m);
 void define_planning(nanobind::module_& m);

@@ -11,6 +11,7 @@ NB_MODULE(_native, m) {
   define_depth(m);
   define_field(m);
   define_matching(m);
+  define_measurements(m);
   define_optimize(m);
   define_path_speed(m);
   define_planning(m);

@@ -330,6 +330,7 @@ int main() {
   check_errors();
   check_path_speed();
   check_depth();
+  check_measurements();
   check_bench();
   for (const std::string& isa : available_isas()) {
     set_isa(isa);

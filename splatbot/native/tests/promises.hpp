@@ -17,4 +17,5 @@ void check_planning();
 void check_collision(const std::string& isa);
 void check_path_speed();
 void check_depth();
+void check_measurements();
 void check_bench();

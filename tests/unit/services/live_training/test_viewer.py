@@ -144,7 +144,7 @@ def test_a_training_has_the_same_bits_with_and_without_a_browser(
         poses = [view.T_world_camera.ravel().tolist() for view in data.views]
 
         def observe(loss: float) -> None:
-            """Want another view at each third step, which its photograph answers; pictures follow."""
+            """Request another view at each third step: its photograph comes, and pictures follow."""
             clock.now += 10.0  # so that each step may draw
             client, step = page.clients[0], seen.trainer.iteration
             earlier = client.request
