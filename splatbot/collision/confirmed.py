@@ -275,14 +275,14 @@ def _agreeing(
     points: Array, owner: NDArray[np.int64], views: Sequence[DepthView], floor: float, quad: float
 ) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
     """Return how many other views measure each point (P,), and whether hardly any sees through it (P,)."""
-    counts = np.zeros((len(points), 3), np.int32)
+    points, owner, counts = np.ascontiguousarray(points), owner.astype(np.int32), np.zeros((len(points), 3), np.int32)
     for number, (depth, camera, T_world_camera) in enumerate(views):
         count_measurements(
             np.ascontiguousarray(depth, dtype=np.float32),
             (camera.fx, camera.fy, camera.cx, camera.cy),
             np.ascontiguousarray(inverse(T_world_camera)),
-            np.ascontiguousarray(points),
-            owner.astype(np.int32),
+            points,
+            owner,
             view=number,
             agreement=(CONSTANTS.agreement_sigma * floor, CONSTANTS.agreement_sigma * quad),
             passage=(VISIBILITY.depth_tolerance, VISIBILITY.depth_tolerance_per_z2),
