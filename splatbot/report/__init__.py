@@ -1,5 +1,1 @@
-"""The report of a run: one self-contained HTML page."""
-
-from splatbot.report.page import report_html
-
-__all__ = ["report_html"]
+"""Reports and pictures: HTML pages, plots, and views with robots, grasps and objects."""

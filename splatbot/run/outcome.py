@@ -15,7 +15,6 @@ from splatbot import __version__
 from splatbot.calibration.timing import SensorTiming
 from splatbot.errors import SplatbotError
 from splatbot.gaussians import GaussianModel
-from splatbot.report import report_html
 from splatbot.results.audit import RunAudit, audit_metrics, audit_run
 from splatbot.results.cameras import camera_metrics
 from splatbot.results.folder import FrameRow, RunFolder
@@ -96,6 +95,8 @@ class RunOutcome:
         if self.audit is not None:
             folder.save_audit(self.audit.summary())
         self.loop.progress("reporting")
+        from splatbot.report.page import report_html  # loads matplotlib, which nothing else of a run needs
+
         map_page = self._save_map_page(folder)
         folder.save_report(
             report_html(
