@@ -15,6 +15,7 @@ from splatbot.protocols import Array
 
 _WINDOW_S = 0.3  # [s] states that decide whether the arm rests
 _LEAST_S = 0.1  # [s] they must span, by their stamps and by their arrivals
+_FEWEST = 3  # that decide: two may lie on both sides of a turning point
 _MOST = 2000  # states that are kept, however slowly the clock of a simulated robot runs
 _STILL = 1e-3  # [rad or m] largest motion of an arm at rest within them
 
@@ -72,7 +73,7 @@ class ArmStates:
                 return
             self._restarted = False
             self._samples.append(_Sample(now, stamp, position, velocity))
-            while len(self._samples) > 2 and _span(self._samples[0], self._samples[-1]) > _WINDOW_S:
+            while len(self._samples) > _FEWEST and _span(self._samples[0], self._samples[-1]) > _WINDOW_S:
                 self._samples.popleft()
 
     @property
@@ -93,7 +94,7 @@ class ArmStates:
         """
         with self._lock:
             samples = [] if self._restarted else [each for each in self._samples if each.arrived > arrived]
-        if not samples or _span(samples[0], samples[-1]) < _LEAST_S:
+        if len(samples) < _FEWEST or _span(samples[0], samples[-1]) < _LEAST_S:
             return False
         return bool(np.ptp([sample.position for sample in samples], axis=0).max() <= _STILL)
 

@@ -428,6 +428,18 @@ def test_a_joint_rests_once_it_stood_for_the_window_of_a_clock_however_slowly_th
     assert found == [False] * first + [True] * (40 - first)
 
 
+@pytest.mark.parametrize("period", [0.12, 0.2, 0.4])
+def test_a_joint_that_turns_between_two_sparse_states_moves(period: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """States on both sides of a turning point have one position; a joint that stands has it three times."""
+    turn, first = 5.0, 2  # [s] at which it turns, and the state before it
+    stamps = [turn + period * (k - first - 0.5) for k in range(6)]
+    turning = [(10.0 + stamp, stamp, (stamp - turn) ** 2) for stamp in stamps]
+    assert turning[first][2] == pytest.approx(turning[first + 1][2])
+    assert _rest_after(monkeypatch, turning) == [False] * 6
+    standing = [(at, stamp, 1.0) for at, stamp, _ in turning]
+    assert _rest_after(monkeypatch, standing) == [False] * 2 + [True] * 4
+
+
 def test_a_pick_is_executed_goal_by_goal() -> None:
     with connected(lag=0.005) as (controller, arm):
         picker = Picker(sampler(), controller, FakeGripper(width=0.06), options=OPTIONS)
