@@ -17,6 +17,13 @@ from splatbot.tracking.budget import Budget, CostModel, table_ms
 from tests.unit.tracking.test_tracker import Run
 
 
+@pytest.fixture
+def stopped_clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No time passes between two lines of a test, however busy the machine is."""
+    now = time.perf_counter()
+    monkeypatch.setattr(time, "perf_counter", lambda: now)
+
+
 def test_a_budget_buys_pixels_steps_and_keypoints_by_one_table() -> None:
     rows = [TrackingConfig(budget_ms=ms) for ms in (30, 99, 100, 300, 1000, 5000)]
     assert [row.n_pixels for row in rows] == sorted(row.n_pixels for row in rows)
@@ -60,6 +67,7 @@ def test_one_slow_run_excludes_no_stage_and_two_do_until_they_are_forgotten() ->
     assert costs.expected_ms("detect", 500) == pytest.approx(1.5 * usual)
 
 
+@pytest.mark.usefixtures("stopped_clock")
 def test_stages_that_were_slow_at_times_are_started_while_lost() -> None:
     costs = CostModel()
     for slowness in (1.0, 8.0, 1.0, 8.0, 1.0):
@@ -82,6 +90,7 @@ def test_time_that_has_passed_is_not_left() -> None:
     assert counted.left_ms == pytest.approx(50.0 - table_ms("overhead", 1) - table_ms("detect", 1000))
 
 
+@pytest.mark.usefixtures("stopped_clock")
 def test_the_overhead_of_most_frames_outside_the_stages_is_reserved() -> None:
     costs = CostModel()
     for ms in (7.0, 3.0, 7.0, 7.0, 60.0):  # the last frame becomes a keyframe
@@ -126,7 +135,8 @@ def test_with_little_time_there_are_fewer_keypoints() -> None:
     assert len(few) < 0.7 * len(many)
 
 
-def test_slow_stages_are_skipped_once_their_runs_are_recorded() -> None:
+def test_slow_stages_are_skipped_once_their_runs_are_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(time, "perf_counter", time.thread_time)  # other programs take no part in it
     run = Run(tracking__deterministic=False, tracking__budget_ms=1000)
     assert "features" in run.track(run.frames[1]).stage_ms
     costs = run.tracker._costs
