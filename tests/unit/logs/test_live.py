@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import threading
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -19,6 +20,7 @@ from splatbot.logs.live import RecordedCamera
 from splatbot.robots.cameras import ReplayCamera
 from splatbot.robots.cameras.replay import ReplayOptions
 from tests.conftest import MakeLog
+from tests.waiting import until
 
 
 class GivenFrames:
@@ -179,12 +181,23 @@ def test_a_clock_that_was_set_back_ends_the_recording(
     assert len(open_log(tmp_path / "a.mcap")) == 3
 
 
-def test_a_silent_camera_ends_after_its_seconds(make_log: MakeLog, tmp_path: Path) -> None:
+def test_a_silent_camera_ends_after_its_seconds(
+    make_log: MakeLog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The seconds end in a silence of a minute, once both frames before it are recorded; those after it are not."""
+    recording: list[RecordedCamera] = []
+
+    class Seconds(threading.Timer):
+        def run(self) -> None:
+            until(lambda: recording and len(recording[0]) == 2)
+            super().run()
+
+    monkeypatch.setattr(live.threading, "Timer", Seconds)
+    monkeypatch.setattr(live, "time", SimpleNamespace(monotonic=lambda: 0.0))  # no frame ends it
     camera = ReplayCamera(open_log(make_log(4)), ReplayOptions(stall=2, stall_s=60))
-    recorded, begun = RecordedCamera(camera, tmp_path / "a.mcap", seconds=1.5), time.monotonic()
-    list(recorded.arrivals())
-    assert time.monotonic() - begun < 5
-    assert len(recorded) == 2
+    recording.append(RecordedCamera(camera, tmp_path / "a.mcap", seconds=0.5))
+    list(recording[0].arrivals())
+    assert len(recording[0]) == len(open_log(tmp_path / "a.mcap")) == 2
 
 
 def test_an_existing_recording_is_replaced_only_by_a_complete_one(make_log: MakeLog, tmp_path: Path) -> None:
