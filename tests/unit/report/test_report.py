@@ -74,6 +74,7 @@ def decode_png(data: bytes) -> NDArray[np.uint8]:
 def report(log: Log, out: Path, **kwargs: Any) -> tuple[RunResult, Page]:
     assert log.ground_truth is not None
     result = map_log(log, out=out, slam=OracleSlam(log.ground_truth, **kwargs))
+    assert result.signal is None  # else the report is left out
     return result, Page(RunFolder(out).report.read_text())
 
 
