@@ -166,6 +166,10 @@ def _key(run: RunFolder, model: GaussianModel, field: GaussianCollisionField) ->
     return digest.hexdigest()
 
 
+def _digest(kept: KeptSurface) -> str:
+    return hashlib.sha256(kept.blocks.tobytes() + b"cells" + kept.cells.tobytes()).hexdigest()
+
+
 def _load(run: RunFolder, key: str) -> KeptSurface:
     """Load the kept surface of a map.
 
@@ -177,12 +181,14 @@ def _load(run: RunFolder, key: str) -> KeptSurface:
     with np.load(run.measured, allow_pickle=False) as file:
         if str(file["key"]) != key:
             raise ValueError("is of another map")
-        kept = KeptSurface(file["blocks"], file["cells"])
+        kept, digest = KeptSurface(file["blocks"], file["cells"]), file["digest"]
     if any(values.dtype != np.int32 or values.shape[1:] != (3,) for values in (kept.blocks, kept.cells)):
         raise ValueError("has other arrays")
+    if str(digest) != _digest(kept):
+        raise ValueError("is damaged")
     return kept
 
 
 def _save(run: RunFolder, key: str, kept: KeptSurface) -> None:
     with atomic_write(run.measured) as file:
-        np.savez(file, key=np.array(key), blocks=kept.blocks, cells=kept.cells)
+        np.savez(file, key=np.array(key), digest=np.array(_digest(kept)), blocks=kept.blocks, cells=kept.cells)
